@@ -1,0 +1,1 @@
+"""Everything simulated: the robot cell, its driver, the demos and the experiments."""

@@ -1,0 +1,1 @@
+"""Experiments in lock-step, without ROS: one module per table or figure."""

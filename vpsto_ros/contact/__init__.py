@@ -1,0 +1,1 @@
+"""Contact dynamics: planar shapes and quasi-static pushing (6.3.1)."""

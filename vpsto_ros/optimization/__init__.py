@@ -1,0 +1,1 @@
+"""The stochastic search over via-points: evolution strategies, cost terms and VP-STO (4.3)."""

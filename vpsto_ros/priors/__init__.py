@@ -1,0 +1,1 @@
+"""Gaussian priors over via-points (4.3.1)."""

@@ -1,0 +1,1 @@
+"""Trajectories from optimal basis functions and their minimal duration (ch. 3)."""
