@@ -1,0 +1,159 @@
+"""The ``vpsto`` command: demos over ROS 2 topics, experiments in lock-step, benchmarks."""
+
+import os
+
+# Before NumPy is imported anywhere: two BLAS threads on a busy two-core machine slow small products down many times.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import importlib
+import math
+import sys
+from collections.abc import Callable, Sequence
+from types import ModuleType
+
+from vpsto_ros import __version__
+from vpsto_ros.exceptions import VpstoError
+
+EXAMPLES = """\
+examples:
+  vpsto demo push_box                         watch the arm push a box to a moving target; results in output/push_box
+  vpsto demo push_box --viewer                the same with a live 3-D view in the browser
+  vpsto demo push_box --real-time-factor 0.5  on a slow machine: simulated time runs at half speed
+  vpsto experiment push_box --runs 20         the closed loop on 20 random boxes, in lock-step and without ROS
+  vpsto bench --json bench.json               how long synthesis, search, replanning and the driver take here
+
+exit status: 0 success, 1 the run failed, 2 the command was not understood
+"""
+
+DEMOS = {"push_box": "sim_bridge.demo"}
+EXPERIMENTS = {"push_box": "sim_bridge.experiments.push_box", "push_t": "sim_bridge.experiments.push_t"}
+
+
+def positive(text: str) -> float:
+    """A finite number above zero, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number of at least one, for argparse."""
+    return _whole(text, minimum=1)
+
+
+def seed(text: str) -> int:
+    """A seed: a whole number from zero up, for argparse."""
+    return _whole(text, minimum=0)
+
+
+def _whole(text: str, minimum: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = minimum - 1
+    if value < minimum:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {minimum} up")
+    return value
+
+
+def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The command line.
+
+    Args:
+        chosen: the arguments that will be parsed. Only the demo or experiment named there is imported for its own options, so
+            that ``vpsto --help`` answers at once.
+    """
+    parser = argparse.ArgumentParser(
+        prog="vpsto",
+        description="Plan contact in real time with via-point-based stochastic trajectory optimisation (VP-STO).",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"vpsto {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    demo = commands.add_parser("demo", help="run the nodes as separate processes over ROS 2 topics and judge the run")
+    _add_modules(demo, "DEMO", DEMOS, chosen, _demo_arguments)
+    experiment = commands.add_parser("experiment", help="repeat a task many times in lock-step, without ROS")
+    _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, chosen, _experiment_arguments)
+    bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
+    bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
+    bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")
+    bench.set_defaults(module="sim_bridge.bench")
+    warm_up = commands.add_parser("warm-up", help="compile the numerical kernels into the disk cache")
+    warm_up.set_defaults(module="sim_bridge.warm_up")
+    return parser
+
+
+def _add_modules(
+    parser: argparse.ArgumentParser,
+    noun: str,
+    modules: dict[str, str],
+    chosen: Sequence[str],
+    add_arguments: Callable[[argparse.ArgumentParser, str], None],
+) -> None:
+    names = parser.add_subparsers(dest="name", metavar=noun, required=True, help="one of: " + ", ".join(modules))
+    for name, module in modules.items():
+        # "resolve": a module may give one of the common options another default or meaning.
+        options = names.add_parser(name, conflict_handler="resolve")
+        add_arguments(options, name)
+        if name in chosen and hasattr(loaded := _load(module), "add_arguments"):
+            loaded.add_arguments(options)
+        options.set_defaults(module=module)
+
+
+def _demo_arguments(parser: argparse.ArgumentParser, name: str) -> None:
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of camera noise and search (default 0)")
+    parser.add_argument(
+        "--duration", type=positive, default=60.0, metavar="S", help="simulated seconds at most (default 60)"
+    )
+    parser.add_argument("--out", default=f"output/{name}", metavar="DIR", help=f"results (default output/{name})")
+    parser.add_argument("--viewer", action="store_true", help="open a live 3-D view in the browser, on 127.0.0.1")
+    parser.add_argument(
+        "--real-time-factor", type=positive, default=1.0, metavar="X", help="simulated per real second (default 1)"
+    )
+
+
+def _experiment_arguments(parser: argparse.ArgumentParser, name: str) -> None:
+    parser.add_argument("--runs", type=count, default=100, metavar="N", help="random episodes (default 100)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of the first episode (default 0)")
+    out = f"output/experiment_{name}"
+    parser.add_argument("--out", default=out, metavar="DIR", help=f"results (default {out})")
+
+
+def _load(module: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        remedy = "make install, or pip install 'vpsto_ros[ros,sim]'"
+        raise VpstoError(f"the Python package {error.name!r} is missing; install it: {remedy}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the ``vpsto`` command.
+
+    Returns:
+        0 on success, 1 when the run failed. A command that is not understood exits with status 2.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        parsed = build_parser(given).parse_args(given)
+        return _load(parsed.module).run(parsed)
+    except VpstoError as error:
+        print(f"vpsto: error: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        # The reader of our output left, as `| head` does; nothing can be printed any more, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
