@@ -1,0 +1,89 @@
+"""From motions of the tool in the table plane to joint trajectories whose limits hold at every instant."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.exceptions import InfeasibleError
+from vpsto_ros.robot.inverse_kinematics import TableMap
+from vpsto_ros.robot.kinematics import Robot, forward_kinematics_batch
+from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize
+
+
+def resting(position: NDArray, start: float, end: float) -> Trajectory:
+    """A trajectory that stays at one position from `start` to `end` [s]."""
+    return Trajectory.from_points(np.array([start, end]), np.stack([position] * 2), np.zeros((2, len(position))))
+
+
+def extended(trajectory: Trajectory, end: float) -> Trajectory:
+    """The trajectory, resting at its last position until `end` if it is over earlier."""
+    if trajectory.end_time >= end - 1e-9:
+        return trajectory
+    last = trajectory(trajectory.end_time)
+    return trajectory.followed_by(resting(last, trajectory.end_time, end))
+
+
+@dataclasses.dataclass(frozen=True)
+class TablePath:
+    """Maps plane trajectories to joint trajectories through dense key positions.
+
+    The joint trajectory is the spline of ch. 3 through the joint positions of the plane trajectory at evenly spaced times: with
+    about 40 ms between key positions its tool stays within a small fraction of a millimetre of the plane. Its limits are those of the
+    joints, and its duration is never below the minimal one (3.16), so they hold by construction.
+
+    Attributes:
+        robot: joint limits.
+        table_map: inverse kinematics of the plane.
+        spacing: time between key positions [s].
+        height_tolerance: largest allowed deviation of the tool from the plane [m].
+    """
+
+    robot: Robot
+    table_map: TableMap
+    spacing: float = 0.04
+    height_tolerance: float = 0.004
+
+    def joints(self, plane: Trajectory, position: NDArray, velocity: NDArray) -> Trajectory:
+        """The joint trajectory that follows a plane trajectory from the given joint state to rest.
+
+        Args:
+            plane: motion of the tool (x, y), ending at rest.
+            position: joint positions at its start [rad]; they may differ slightly from the plane's inverse kinematics.
+            velocity: joint velocities at its start [rad/s].
+
+        Raises:
+            InfeasibleError: the motion leaves the reachable plane, or the arm cannot follow it within limits and height tolerance.
+        """
+        count = int(np.clip(np.ceil(plane.duration / self.spacing), 4, 100))
+        phases = np.linspace(0.0, 1.0, count + 1)
+        keys = self.table_map.joints(plane(plane.start_time + phases * plane.duration))
+        # What differs at the start (a remainder of the spline through the previous key positions) fades out along the way.
+        keys = keys + (1.0 - phases[:, None]) ** 3 * (position - keys[0])
+        trajectory = synthesize_at_least(
+            OptimalBasis.uniform(count - 1), keys, velocity, self.robot, plane.duration, plane.start_time
+        )
+        self.check(trajectory)
+        return trajectory
+
+    def check(self, trajectory: Trajectory) -> None:
+        """Raise InfeasibleError unless joint limits and tool height hold along a trajectory."""
+        broken = trajectory.violations(self.robot.limits)
+        if broken:
+            raise InfeasibleError("joint limits do not hold: " + "; ".join(broken))
+        times = np.linspace(trajectory.start_time, trajectory.end_time, 4 * len(trajectory.times))
+        heights = forward_kinematics_batch(trajectory(times))[:, 2]
+        worst = float(np.abs(heights - self.table_map.height).max())
+        if worst > self.height_tolerance:
+            raise InfeasibleError(f"the tool would leave its plane by {1e3 * worst:.1f} mm (allowed {1e3 * self.height_tolerance:.1f})")
+
+
+def synthesize_at_least(
+    basis: OptimalBasis, keys: NDArray, velocity: NDArray, robot: Robot, duration: float, start_time: float
+) -> Trajectory:
+    """The timing-optimal spline through joint key positions, stretched to `duration` [s] when it could be shorter."""
+    rest = np.zeros_like(velocity)
+    fastest = synthesize(basis, keys, velocity, rest, robot.limits, start_time=start_time)
+    if fastest.duration >= duration:
+        return fastest
+    return synthesize(basis, keys, velocity, rest, robot.limits, duration=duration, start_time=start_time)
