@@ -1,0 +1,265 @@
+"""The Franka Research 3 with a pushing rod: limits, dynamics through Pinocchio, and fast batched kinematics of its own.
+
+One robot description (``models/fr3_pusher.xml``) is read by Pinocchio here and by the simulator elsewhere. What the planners
+call thousands of times per replan, the position of the tool tip, is compiled here from the modified DH table instead.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+from vpsto_ros.trajectory.timing import Limits
+
+MODEL_PATH = Path(__file__).parent / "models" / "fr3_pusher.xml"
+JOINT_NAMES = tuple(f"fr3_joint{i}" for i in range(1, 8))
+
+# Limits of the FR3 that its MJCF cannot hold (Pinocchio leaves the velocity limit of an MJCF infinite) [rad/s, rad/s², Nm/s].
+VELOCITY_LIMITS = (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26)
+ACCELERATION_LIMITS = (10.0,) * 7
+TORQUE_RATE_LIMITS = (1000.0,) * 7
+
+SHOULDER_HEIGHT = 0.333  # from the base to joint 2 [m]
+UPPER_ARM = 0.316
+FOREARM = 0.384
+ELBOW_OFFSET = 0.0825
+WRIST_OFFSET = 0.088
+FLANGE_OFFSET = 0.107
+TOOL_LENGTH = 0.16  # from the flange to the tip of the rod
+
+# Modified DH rows (a, d, cos alpha, sin alpha); alpha is a multiple of 90 degrees, so its sine and cosine are exact.
+_DH = np.array(
+    [
+        (0.0, SHOULDER_HEIGHT, 1.0, 0.0),
+        (0.0, 0.0, 0.0, -1.0),
+        (0.0, UPPER_ARM, 0.0, 1.0),
+        (ELBOW_OFFSET, 0.0, 0.0, 1.0),
+        (-ELBOW_OFFSET, FOREARM, 0.0, -1.0),
+        (0.0, 0.0, 0.0, 1.0),
+        (WRIST_OFFSET, 0.0, 0.0, 1.0),
+    ]
+)
+_TIP = FLANGE_OFFSET + TOOL_LENGTH
+
+
+@njit(cache=True, nogil=True)
+def _advance(dh, i, angle, p, x, y, z):
+    """Move the frame (p; x, y, z) over joint i of the modified DH table, in place."""
+    a, d, ca, sa = dh[i, 0], dh[i, 1], dh[i, 2], dh[i, 3]
+    c, s = np.cos(angle), np.sin(angle)
+    for k in range(3):
+        side = ca * y[k] + sa * z[k]
+        axis = ca * z[k] - sa * y[k]
+        p[k] += a * x[k] + d * axis
+        along = x[k]
+        x[k] = c * along + s * side
+        y[k] = c * side - s * along
+        z[k] = axis
+
+
+@njit(cache=True, nogil=True)
+def _reset(p, x, y, z):
+    for k in range(3):
+        p[k] = 0.0
+        x[k] = y[k] = z[k] = 0.0
+    x[0] = y[1] = z[2] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _tip_positions(dh, tip, q):
+    count = q.shape[0]
+    out = np.empty((count, 3))
+    p, x, y, z = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for b in range(count):
+        _reset(p, x, y, z)
+        for i in range(7):
+            _advance(dh, i, q[b, i], p, x, y, z)
+        for k in range(3):
+            out[b, k] = p[k] + tip * z[k]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _tip_velocities(dh, tip, q, qd):
+    """Velocity of the tip: the sum over joints of axis x (tip - joint) times the joint's velocity."""
+    count = q.shape[0]
+    out = np.zeros((count, 3))
+    p, x, y, z = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    origins, axes = np.empty((7, 3)), np.empty((7, 3))
+    for b in range(count):
+        _reset(p, x, y, z)
+        for i in range(7):
+            _advance(dh, i, q[b, i], p, x, y, z)
+            origins[i] = p
+            axes[i] = z
+        for i in range(7):
+            lx = p[0] + tip * z[0] - origins[i, 0]
+            ly = p[1] + tip * z[1] - origins[i, 1]
+            lz = p[2] + tip * z[2] - origins[i, 2]
+            out[b, 0] += qd[b, i] * (axes[i, 1] * lz - axes[i, 2] * ly)
+            out[b, 1] += qd[b, i] * (axes[i, 2] * lx - axes[i, 0] * lz)
+            out[b, 2] += qd[b, i] * (axes[i, 0] * ly - axes[i, 1] * lx)
+    return out
+
+
+def _joint_rows(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    rows = np.ascontiguousarray(values, dtype=float)
+    if rows.ndim != 2 or rows.shape[1] != 7:
+        raise InvalidInputError(f"{name} must have shape (B, 7), got {rows.shape}")
+    return rows
+
+
+def forward_kinematics_batch(q: ArrayLike) -> NDArray[np.float64]:
+    """Positions of the tool tip in the base frame.
+
+    Args:
+        q: joint positions [rad], shape (B, 7).
+
+    Returns:
+        Tip positions [m], shape (B, 3).
+
+    Raises:
+        InvalidInputError: q has another shape.
+    """
+    return _tip_positions(_DH, _TIP, _joint_rows(q, "q"))
+
+
+def tip_velocity_batch(q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
+    """Linear velocities of the tool tip in the base frame.
+
+    Args:
+        q: joint positions [rad], shape (B, 7).
+        qd: joint velocities [rad/s], shape (B, 7).
+
+    Returns:
+        Tip velocities [m/s], shape (B, 3).
+
+    Raises:
+        InvalidInputError: q or qd has another shape, or they differ in length.
+    """
+    rows, rates = _joint_rows(q, "q"), _joint_rows(qd, "qd")
+    if len(rows) != len(rates):
+        raise InvalidInputError(f"q and qd must have as many rows as each other, got {len(rows)} and {len(rates)}")
+    return _tip_velocities(_DH, _TIP, rows, rates)
+
+
+class Robot:
+    """A serial arm read from an MJCF file: kinematics and dynamics of its tool tip through Pinocchio.
+
+    Not thread-safe: the Pinocchio workspace is shared by the methods of one instance. The compiled functions of this module are.
+
+    Attributes:
+        joint_names: names of the joints, in the order of q.
+        limits: position, velocity and acceleration limits of the joints.
+        torque_limits: largest joint torques [Nm], shape (n,).
+        torque_rate_limits: largest rates of the joint torques [Nm/s], shape (n,).
+    """
+
+    def __init__(self, model, *, velocity: ArrayLike, acceleration: ArrayLike, torque_rate: ArrayLike, tip: str):
+        """Wrap a Pinocchio model; see :meth:`from_mjcf`."""
+        import pinocchio
+
+        self._pin = pinocchio
+        self._model = model
+        self._data = model.createData()
+        if not model.existFrame(tip):
+            raise ConfigurationError(f"the robot description has no frame '{tip}'; it has: {_frame_names(model)}")
+        self._tip = model.getFrameId(tip)
+        self.joint_names: tuple[str, ...] = tuple(list(model.names)[1:])
+        self.torque_limits = _per_joint(model.effortLimit, model.nv, "effort limits")
+        self.torque_rate_limits = _per_joint(torque_rate, model.nv, "torque_rate")
+        self.limits = Limits(
+            velocity=_per_joint(velocity, model.nv, "velocity"),
+            acceleration=_per_joint(acceleration, model.nv, "acceleration"),
+            lower=np.array(model.lowerPositionLimit),
+            upper=np.array(model.upperPositionLimit),
+        )
+
+    @classmethod
+    def from_mjcf(
+        cls,
+        path: str | Path,
+        *,
+        velocity: Sequence[float] = VELOCITY_LIMITS,
+        acceleration: Sequence[float] = ACCELERATION_LIMITS,
+        torque_rate: Sequence[float] = TORQUE_RATE_LIMITS,
+        tip: str = "tool_tip",
+    ) -> "Robot":
+        """Read a robot description.
+
+        Args:
+            path: MJCF file. Everything that belongs to the robot must be inside its first top-level body, and that body must be
+                at the origin: Pinocchio reads no other and drops its offset.
+            velocity: velocity limits [rad/s], one per joint (an MJCF holds none).
+            acceleration: acceleration limits [rad/s²], one per joint.
+            torque_rate: limits of the torque rates [Nm/s], one per joint.
+            tip: name of the frame (MJCF site) at the tip of the tool.
+
+        Raises:
+            ConfigurationError: there is no such file or frame, or a limit has not one entry per joint.
+        """
+        import pinocchio
+
+        if not Path(path).is_file():
+            raise ConfigurationError(f"no robot description at '{path}'")
+        model = pinocchio.buildModelFromMJCF(str(path))
+        return cls(model, velocity=velocity, acceleration=acceleration, torque_rate=torque_rate, tip=tip)
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return self._model.nv
+
+    def forward(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position (3,) [m] and rotation matrix (3, 3) of the tool tip for joint positions q (n,) [rad]."""
+        self._pin.framesForwardKinematics(self._model, self._data, self._vector(q, "q"))
+        placement = self._data.oMf[self._tip]
+        return placement.translation.copy(), placement.rotation.copy()
+
+    def jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Jacobian (6, n) of the tool tip at q (n,) [rad]: rows 0-2 linear, 3-5 angular velocity, along the axes of the base."""
+        frame = self._pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return self._pin.computeFrameJacobian(self._model, self._data, self._vector(q, "q"), self._tip, frame)
+
+    def inverse_dynamics(self, q: NDArray, qd: NDArray, qdd: NDArray) -> NDArray[np.float64]:
+        """Torques M(q) qdd + C(q, qd) qd + g(q) [Nm], shape (n,); eq. (2.1) without external forces.
+
+        One recursive Newton-Euler pass; called every control cycle, so that its arguments go to Pinocchio unchecked.
+        """
+        return self._pin.rnea(self._model, self._data, q, qd, qdd)
+
+    def mass_matrix(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Inertia matrix M(q) (n, n) [kg m²] at q (n,) [rad]."""
+        return self._pin.crba(self._model, self._data, self._vector(q, "q")).copy()
+
+    def gravity(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Torques g(q) [Nm], shape (n,), that hold the arm still at q (n,) [rad]."""
+        return self._pin.computeGeneralizedGravity(self._model, self._data, self._vector(q, "q")).copy()
+
+    def _vector(self, values: ArrayLike, name: str) -> NDArray[np.float64]:
+        vector = np.asarray(values, dtype=float)
+        if vector.shape != (self.dof,):
+            raise InvalidInputError(f"{name} must have shape ({self.dof},), got {vector.shape}")
+        return vector
+
+
+def _per_joint(values: ArrayLike, dof: int, name: str) -> NDArray[np.float64]:
+    vector = np.array(values, dtype=float)
+    if vector.shape != (dof,) or not np.all(vector > 0.0):
+        raise ConfigurationError(f"{name} must be {dof} positive numbers, one per joint, got {values!r}")
+    vector.setflags(write=False)
+    return vector
+
+
+def _frame_names(model) -> str:
+    return ", ".join(frame.name for frame in model.frames)
+
+
+@lru_cache(maxsize=1)
+def fr3_pusher() -> Robot:
+    """The Franka Research 3 with the pushing rod, read once and shared (see the note on threads at :class:`Robot`)."""
+    return Robot.from_mjcf(MODEL_PATH)
