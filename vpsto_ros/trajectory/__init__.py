@@ -1,1 +1,24 @@
 """Trajectories from optimal basis functions and their minimal duration (ch. 3)."""
+
+from vpsto_ros.trajectory.basis import OptimalBasis
+from vpsto_ros.trajectory.synthesis import braking_trajectory, synthesize
+from vpsto_ros.trajectory.timing import (
+    MINIMUM_DURATION,
+    Limits,
+    TrajectoryBatch,
+    minimal_duration,
+    synthesize_batch,
+)
+from vpsto_ros.trajectory.trajectory import Trajectory
+
+__all__ = [
+    "MINIMUM_DURATION",
+    "Limits",
+    "OptimalBasis",
+    "Trajectory",
+    "TrajectoryBatch",
+    "braking_trajectory",
+    "minimal_duration",
+    "synthesize",
+    "synthesize_batch",
+]
