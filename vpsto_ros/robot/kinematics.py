@@ -47,63 +47,30 @@ _TIP = FLANGE_OFFSET + TOOL_LENGTH
 
 
 @njit(cache=True, nogil=True)
-def _advance(dh, i, angle, p, x, y, z):
-    """Move the frame (p; x, y, z) over joint i of the modified DH table, in place."""
-    a, d, ca, sa = dh[i, 0], dh[i, 1], dh[i, 2], dh[i, 3]
-    c, s = np.cos(angle), np.sin(angle)
-    for k in range(3):
-        side = ca * y[k] + sa * z[k]
-        axis = ca * z[k] - sa * y[k]
-        p[k] += a * x[k] + d * axis
-        along = x[k]
-        x[k] = c * along + s * side
-        y[k] = c * side - s * along
-        z[k] = axis
+def _tip_motion(dh, tip, q, qd, position, velocity):
+    """Positions and, if the array is not empty, velocities of the tips, shapes (B, 3).
 
-
-@njit(cache=True, nogil=True)
-def _reset(p, x, y, z):
-    for k in range(3):
-        p[k] = 0.0
-        x[k] = y[k] = z[k] = 0.0
-    x[0] = y[1] = z[2] = 1.0
-
-
-@njit(cache=True, nogil=True)
-def _tip_positions(dh, tip, q):
-    count = q.shape[0]
-    out = np.empty((count, 3))
-    p, x, y, z = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for b in range(count):
-        _reset(p, x, y, z)
-        for i in range(7):
-            _advance(dh, i, q[b, i], p, x, y, z)
-        for k in range(3):
-            out[b, k] = p[k] + tip * z[k]
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _tip_velocities(dh, tip, q, qd):
-    """Velocity of the tip: the sum over joints of axis x (tip - joint) times the joint's velocity."""
-    count = q.shape[0]
-    out = np.zeros((count, 3))
-    p, x, y, z = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    origins, axes = np.empty((7, 3)), np.empty((7, 3))
-    for b in range(count):
-        _reset(p, x, y, z)
-        for i in range(7):
-            _advance(dh, i, q[b, i], p, x, y, z)
-            origins[i] = p
-            axes[i] = z
-        for i in range(7):
-            lx = p[0] + tip * z[0] - origins[i, 0]
-            ly = p[1] + tip * z[1] - origins[i, 1]
-            lz = p[2] + tip * z[2] - origins[i, 2]
-            out[b, 0] += qd[b, i] * (axes[i, 1] * lz - axes[i, 2] * ly)
-            out[b, 1] += qd[b, i] * (axes[i, 2] * lx - axes[i, 0] * lz)
-            out[b, 2] += qd[b, i] * (axes[i, 0] * ly - axes[i, 1] * lx)
-    return out
+    The tip is handed from frame to frame, from the flange down to the base, which needs no rotation matrices. It lies on the
+    axis of joint 7, so that this joint moves nothing.
+    """
+    moving = velocity.shape[0] > 0
+    for b in range(q.shape[0]):
+        x, y, z = 0.0, 0.0, tip
+        u, v, w = 0.0, 0.0, 0.0
+        for i in range(6, -1, -1):
+            a, d, ca, sa = dh[i, 0], dh[i, 1], dh[i, 2], dh[i, 3]
+            if i < 6:
+                c, s = np.cos(q[b, i]), np.sin(q[b, i])
+                x, y = c * x - s * y, s * x + c * y
+                if moving:
+                    u, v = c * u - s * v - qd[b, i] * y, s * u + c * v + qd[b, i] * x
+            x, z = x + a, z + d
+            y, z = ca * y - sa * z, sa * y + ca * z
+            if moving:
+                v, w = ca * v - sa * w, sa * v + ca * w
+        position[b, 0], position[b, 1], position[b, 2] = x, y, z
+        if moving:
+            velocity[b, 0], velocity[b, 1], velocity[b, 2] = u, v, w
 
 
 def _joint_rows(values: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -125,7 +92,10 @@ def forward_kinematics_batch(q: ArrayLike) -> NDArray[np.float64]:
     Raises:
         InvalidInputError: q has another shape.
     """
-    return _tip_positions(_DH, _TIP, _joint_rows(q, "q"))
+    rows = _joint_rows(q, "q")
+    position = np.empty((len(rows), 3))
+    _tip_motion(_DH, _TIP, rows, rows, position, np.empty((0, 3)))
+    return position
 
 
 def tip_velocity_batch(q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
@@ -144,7 +114,9 @@ def tip_velocity_batch(q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
     rows, rates = _joint_rows(q, "q"), _joint_rows(qd, "qd")
     if len(rows) != len(rates):
         raise InvalidInputError(f"q and qd must have as many rows as each other, got {len(rows)} and {len(rates)}")
-    return _tip_velocities(_DH, _TIP, rows, rates)
+    position, velocity = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    _tip_motion(_DH, _TIP, rows, rates, position, velocity)
+    return velocity
 
 
 class Robot:
