@@ -127,17 +127,21 @@ class OnlineVpsto:
         self, problem: OnlineProblem, mode: str, deadline: float | None, clock: Callable[[], float]
     ) -> SearchResult:
         n_via = self._n_via(problem, mode)
-        guesses = problem.guesses(n_via)
+        guesses, sigma = problem.guesses(n_via), self.config.explore_sigma
         if mode == "warm_start":
-            rest = problem.shifted(self.previous, n_via)
-            means = np.concatenate([rest[None], guesses])
+            guesses = np.concatenate([problem.shifted(self.previous, n_via)[None], guesses])
             sigma = self.config.warm_sigma
-        else:
-            means, sigma = guesses, self.config.explore_sigma
         return search(
             problem.prior(n_via), problem.evaluate, self.config.search, self.rng,
-            means=means, seeds=means, sigma=sigma, deadline=deadline, clock=clock,
+            means=self._starts(problem, guesses), seeds=guesses, sigma=sigma, deadline=deadline, clock=clock,
         )  # fmt: skip
+
+    def _starts(self, problem: OnlineProblem, guesses: NDArray) -> NDArray:
+        """The guesses from which the search starts: as many as configured, the cheapest ones."""
+        count = self.config.search.starts
+        if len(guesses) <= count:
+            return guesses
+        return guesses[np.argsort(problem.evaluate(guesses).cost, kind="stable")[:count]]
 
     def _n_via(self, problem: OnlineProblem, mode: str) -> int:
         if mode == "explore" or self.config.via_rate == 0.0:

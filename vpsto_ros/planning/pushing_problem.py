@@ -44,11 +44,11 @@ class PushingCosts:
 class Workspace:
     """Where the tool and the object may be, base frame [m]."""
 
-    radius_min: float = option(0.30, "smallest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
-    radius_max: float = option(0.75, "largest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
+    radius_min: float = option(0.305, "smallest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
+    radius_max: float = option(0.76, "largest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
     side: float = option(0.45, "the tool stays within +- side in y", unit="m", minimum=0.0, maximum=2.0)
-    object_x: tuple[float, float] = option((0.36, 0.66), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0)
-    object_y: tuple[float, float] = option((-0.30, 0.30), "range of the object's origin in y", unit="m", minimum=-2.0, maximum=2.0)
+    object_x: tuple[float, float] = option((0.40, 0.64), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0)
+    object_y: tuple[float, float] = option((-0.32, 0.32), "range of the object's origin in y", unit="m", minimum=-2.0, maximum=2.0)
 
     def __post_init__(self) -> None:
         validate(self)

@@ -1,0 +1,116 @@
+"""The closed loop of the pushing demos in lock-step: simulated cell, camera, filter, contact planner and MPC, without ROS.
+
+The planner sees what it would see on a robot: joint positions, late and noisy camera frames, the object's outline. A plan computed at time t
+reaches the arm `transport` seconds later, as a message would.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_bridge.simulation import Simulation
+from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
+from vpsto_ros.estimation.planar_kalman import PlanarKalman
+from vpsto_ros.planning.contact import PushContactPlanner
+from vpsto_ros.planning.goal import PlanarGoal
+from vpsto_ros.planning.pushing import MpcStep, PushingMpc
+from vpsto_ros.trajectory import Trajectory
+
+
+@dataclasses.dataclass
+class Recording:
+    """What happened, sampled at every planning step; ground truth is for judging only."""
+
+    time: list[float] = dataclasses.field(default_factory=list)
+    object_pose: list[NDArray] = dataclasses.field(default_factory=list)
+    tool: list[NDArray] = dataclasses.field(default_factory=list)
+    goal: list[NDArray] = dataclasses.field(default_factory=list)
+    mode: list[str] = dataclasses.field(default_factory=list)
+    compute: list[float] = dataclasses.field(default_factory=list)
+    rejected: list[str] = dataclasses.field(default_factory=list)
+
+
+def command_from(trajectory: Trajectory, joint_names: tuple[str, ...]) -> TrajectoryCommand:
+    """The message that carries a trajectory: knots with velocities, accelerations only where they do not jump."""
+    positions, velocities, accelerations = trajectory.knots()
+    start = trajectory.start_time
+    return TrajectoryCommand(
+        joint_names, start, trajectory.times - start, positions, velocities, np.full_like(accelerations, np.nan)
+    )
+
+
+class PushingLoop:
+    """Runs the closed loop step by step."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        planner: PushingMpc,
+        contact_planner: PushContactPlanner | None,
+        goal: Callable[[float], PlanarGoal],
+        *,
+        period: float = 0.05,
+        transport: float = 0.03,
+    ) -> None:
+        """Connect the parts.
+
+        Args:
+            simulation: the cell.
+            planner: the MPC planner (or a baseline with the same interface).
+            contact_planner: says where to touch; None to leave that to the planner.
+            goal: the goal at a given time.
+            period: planning period [s].
+            transport: time from the start of planning until the arm gets the plan [s].
+        """
+        self.simulation, self.planner, self.contact_planner, self.goal = simulation, planner, contact_planner, goal
+        self.period, self.transport = period, transport
+        self.filter = PlanarKalman()
+        self.recording = Recording()
+        self._next_plan = simulation.time
+
+    def advance(self, duration: float) -> None:
+        """Let `duration` seconds of simulated time pass, planning on time."""
+        end = self.simulation.time + duration
+        while self.simulation.time < end - 1e-9:
+            step = self._plan() if self.simulation.time >= self._next_plan - 1e-9 else None
+            self._run_until(min(self._next_plan, end), step)
+
+    def _run_until(self, end: float, step: MpcStep | None) -> None:
+        if step is not None and step.trajectory is not None:
+            self.simulation.advance(self.transport)
+            self._deliver(step)
+        self.simulation.advance(max(end - self.simulation.time, 0.0))
+        for frame in self.simulation.camera_frames():
+            self.filter.update(frame.stamp, frame.pose, frame.covariance)
+
+    def _plan(self) -> MpcStep:
+        sim, now = self.simulation, self.simulation.time
+        state, goal = self.filter.state, self.goal(now)
+        begin = time.perf_counter()
+        contact = None
+        if state is not None and self.contact_planner is not None:
+            contact = self.contact_planner.plan(now, sim.tool_position()[:2], state, goal)
+        planning = time.perf_counter()
+        step = self.planner.step(now, sim.joint_position, sim.joint_velocity, state, goal, contact)
+        self._record(now, goal, step, time.perf_counter() - planning, planning - begin)
+        self._next_plan = now + self.period
+        return step
+
+    def _deliver(self, step: MpcStep) -> None:
+        try:
+            self.simulation.follower.accept(command_from(step.trajectory, self.planner.robot.joint_names), self.simulation.time)
+            self.planner.accept(step)
+        except TrajectoryRejected as reason:
+            self.recording.rejected.append(str(reason))
+
+    def _record(self, now: float, goal: PlanarGoal, step: MpcStep, planning: float, contact: float) -> None:
+        recording = self.recording
+        recording.time.append(now)
+        recording.object_pose.append(np.array(self.simulation.object_pose()))
+        recording.tool.append(np.array(self.simulation.tool_position()))
+        recording.goal.append(np.append(goal.position, np.nan if goal.yaw is None else goal.yaw))
+        recording.mode.append(step.mode)
+        recording.compute.append(planning)

@@ -1,0 +1,318 @@
+"""Closed-loop planar pushing with an arm: online VP-STO in the table plane, joint trajectories out (4.4, 4.5.2).
+
+The search runs in the plane in which the tool moves: with the tool vertical and at a fixed height, a plane point determines the joints, so
+seven joints would only add directions in which every candidate leaves the plane. The joint trajectory is synthesised from the plane
+solution with the same basis functions and keeps the joint limits at every instant.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.configuration import option, validate
+from vpsto_ros.contact.pushing import PushingModel, rollout
+from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.exceptions import ConfigurationError, InfeasibleError
+from vpsto_ros.planning.contact import ContactPlan
+from vpsto_ros.planning.goal import PlanarGoal
+from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
+from vpsto_ros.planning.pushes import PushRanking
+from vpsto_ros.planning.pushing_problem import PushingCosts, PushingProblem, Workspace
+from vpsto_ros.planning.table_entry import enter_plane
+from vpsto_ros.planning.table_path import TablePath, extended, resting
+from vpsto_ros.robot.inverse_kinematics import TableMap
+from vpsto_ros.robot.kinematics import Robot
+from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory
+
+AT_REST = 0.02
+"""Joint speed below which the arm counts as standing [rad/s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PushingMpcConfig:
+    """Options of the pushing planner."""
+
+    lead: float = option(0.05, "time between the start of planning and the moment the plan takes over", unit="s", minimum=0.005, maximum=1.0)
+    speed: float = option(0.35, "largest tool speed in x and in y", unit="m/s", minimum=0.01, maximum=2.0)
+    acceleration: float = option(1.8, "largest tool acceleration in x and in y", unit="m/s^2", minimum=0.05, maximum=20.0)
+    tool_height: float = option(0.02, "height of the tool's tip above the table", unit="m", minimum=0.002, maximum=0.5)
+    hold_distance: float = option(0.002, "the goal counts as reached, and the arm rests, within", unit="m", minimum=1e-4, maximum=0.5)
+    resume_distance: float = option(0.004, "a resting arm resumes when the object is farther off than", unit="m", minimum=1e-4, maximum=0.5)
+    seeds: int = option(3, "straight pushes from different sides offered as first guesses", minimum=1, maximum=32)
+    seed_separation: float = option(0.03, "distance between the touch points of those", unit="m", minimum=0.0, maximum=1.0)
+    joint_tolerance: float = option(
+        0.06, "the plan is begun anew when a joint is farther from its reference", unit="rad", minimum=1e-3, maximum=1.0
+    )
+    object_timeout: float = option(0.5, "the arm stops when the object's state is older", unit="s", minimum=0.02, maximum=10.0)
+    costs: PushingCosts = dataclasses.field(default_factory=PushingCosts)
+    workspace: Workspace = dataclasses.field(default_factory=Workspace)
+    online: OnlineConfig = dataclasses.field(default_factory=OnlineConfig)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.resume_distance < self.hold_distance:
+            raise ConfigurationError(
+                f"resume_distance = {self.resume_distance} is below hold_distance = {self.hold_distance}; it must not be smaller"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class MpcStep:
+    """Outcome of one planning step.
+
+    Attributes:
+        trajectory: joint trajectory in absolute time, to replace what is being executed, or None when there is nothing to execute. It begins
+            with what is left of the running one until the new plan takes over and ends at rest.
+        mode: "explore", "warm_start", "stop" (no via-points), "hold" (goal reached), "brake" (no valid plan), "enter" (on
+            the way into the plane), "wait" (not ready).
+        valid: whether it is a plan that works, as opposed to a safe stop.
+        message: what happened, in words, for people.
+        cost: cost of the plan [s], inf without one.
+        tool_path: planned tool positions, shape (K, 2) [m].
+        object_path: predicted object poses, shape (K, 3).
+        iterations: iterations of the search.
+        plane: solution in the plane, for the next warm start.
+        ready_at: nothing is planned before this time [s].
+    """
+
+    trajectory: Trajectory | None
+    mode: str
+    valid: bool
+    message: str
+    cost: float = np.inf
+    tool_path: NDArray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
+    object_path: NDArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    iterations: int = 0
+    plane: Trajectory | None = None
+    ready_at: float = -np.inf
+
+
+class PushingMpc:
+    """Plans, 20 to 50 times a second, how the arm pushes an object to a goal."""
+
+    def __init__(self, config: PushingMpcConfig, model: PushingModel, robot: Robot, rng: np.random.Generator) -> None:
+        """Set up the planner.
+
+        Args:
+            config: options.
+            model: contact model: shape, tool, pressure radius, friction.
+            robot: the arm.
+            rng: source of all randomness.
+
+        Raises:
+            ConfigurationError: speed, acceleration and workspace are beyond what the joints can do.
+        """
+        self.config, self.model, self.robot = config, model, robot
+        table_map = TableMap(robot, config.tool_height)
+        _check_workspace(config, table_map)
+        self.table_path = TablePath(robot, table_map)
+        self.limits = Limits(np.full(2, config.speed), np.full(2, config.acceleration))
+        self.online = OnlineVpsto(config.online, rng)
+        costs = config.costs
+        self.ranking = PushRanking(0.8 * config.speed, costs.error, costs.rotation)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything about the running motion, as after a restart of the robot's driver."""
+        self.reference: Trajectory | None = None
+        self.tool_offset = np.zeros(2)
+        self.holding = False
+        self.ready_at = -np.inf
+        self.online.accept(None)
+
+    @property
+    def table_map(self) -> TableMap:
+        """Inverse kinematics of the plane."""
+        return self.table_path.table_map
+
+    def step(
+        self,
+        now: float,
+        joint_position: NDArray,
+        joint_velocity: NDArray,
+        object_state: ObjectState | None,
+        goal: PlanarGoal | None,
+        contact: ContactPlan | None = None,
+        *,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> MpcStep:
+        """Plan once. Call :meth:`accept` when the trajectory has been sent to the robot.
+
+        Args:
+            now: present time [s].
+            joint_position: measured joint positions, shape (7,) [rad].
+            joint_velocity: measured joint velocities, shape (7,) [rad/s].
+            object_state: latest estimate of the object, None if there is none.
+            goal: where the object shall go, None if nobody said.
+            contact: where to touch, None if nobody says.
+            deadline: value of `clock` at which to return the best found so far.
+            clock: source of that time.
+        """
+        if self._lost(now, joint_position):
+            return self._begin(now, joint_position, joint_velocity, object_state)
+        if now + self.config.lead < self.ready_at:
+            return MpcStep(None, "wait", False, "on the way to where planning begins")
+        self._observe_offset(now, joint_position)
+        problem = self._reason_to_stop(now, object_state, goal)
+        if problem:
+            return self._stop(now, "brake", problem)
+        pose = self._object_at(now + self.config.lead, object_state)
+        if self._goal_reached(pose, goal):
+            return self._stop(now, "hold", "the object is at its goal", valid=True)
+        return self._plan(now, pose, goal, contact, deadline, clock)
+
+    def accept(self, step: MpcStep) -> None:
+        """Take note that a step's trajectory is being executed."""
+        if step.trajectory is not None:
+            self.reference = step.trajectory
+            self.online.accept(step.plane)
+            self.ready_at = step.ready_at
+
+    def stop(self, now: float) -> Trajectory | None:
+        """The quickest stop within the joint limits, to be executed at once; None if nothing moves."""
+        if self.reference is None:
+            return None
+        position, velocity, _ = self.reference.state(now)
+        self.online.accept(None)
+        self.reference = extended(braking_trajectory(position, velocity, self.robot.limits, start_time=now), now + 0.5)
+        return self.reference
+
+    def warm_up(self) -> None:
+        """Compile every kernel by planning once for an imaginary object."""
+        tool = np.array([0.42, -0.1])
+        state = ObjectState(0.0, np.array([0.5, 0.0, 0.3]), np.zeros(3), 1e-4 * np.eye(6))
+        joints = self.table_map.joints(tool[None])[0]
+        still = np.zeros_like(joints)
+        for yaw in (None, 0.5):
+            for now in (0.0, 0.3, 0.35):
+                self.accept(self.step(now, joints, still, dataclasses.replace(state, stamp=now), PlanarGoal(np.array([0.55, 0.1]), yaw)))
+            self.stop(0.5)
+            self.reset()
+
+    def _lost(self, now: float, joint_position: NDArray) -> bool:
+        """Whether the arm is not where the running reference says."""
+        if self.reference is None:
+            return True
+        return bool(np.abs(self.reference(now) - joint_position).max() > self.config.joint_tolerance)
+
+    def _begin(self, now: float, position: NDArray, velocity: NDArray, state: ObjectState | None) -> MpcStep:
+        """Take over an arm that stands still; one that is not in the plane is moved there first."""
+        self.reset()
+        if np.abs(velocity).max() > AT_REST:
+            return MpcStep(None, "wait", False, "the arm moves but not by this planner's reference; waiting until it stands still")
+        deviation = np.abs(self.table_map.joints(self.table_map.tool(position)[None])[0] - position).max()
+        height = abs(float(self.robot.forward(position)[0][2]) - self.table_map.height)
+        if not deviation < self.config.joint_tolerance or height > 2.0 * self.table_path.height_tolerance:
+            return self._enter_plane(now, position, state)
+        start = now + 4.0 * self.config.lead
+        rest = resting(position, start, start + 0.5)
+        return MpcStep(rest, "wait", False, "took over the arm where it stands", ready_at=start)
+
+    def _enter_plane(self, now: float, position: NDArray, state: ObjectState | None) -> MpcStep:
+        if state is None:
+            return MpcStep(None, "wait", False, "the tool is not in its plane; lowering it needs the object's state")
+        config, start = self.config, now + 4.0 * self.config.lead
+        try:
+            motion = enter_plane(self.table_path, self.model, config.workspace, position, state.pose, start)
+        except InfeasibleError as error:
+            return MpcStep(None, "wait", False, str(error))
+        return MpcStep(motion, "enter", False, "moving the tool into its plane", ready_at=motion.end_time)
+
+    def _observe_offset(self, now: float, joint_position: NDArray) -> None:
+        """Low-pass the offset of the tool from its reference; under load an impedance-controlled arm lags by millimetres."""
+        offset = self.table_map.tool(joint_position) - self.table_map.tool(self.reference(now))
+        self.tool_offset = self.tool_offset + 0.3 * (offset - self.tool_offset)
+
+    def _reason_to_stop(self, now: float, state: ObjectState | None, goal: PlanarGoal | None) -> str:
+        if goal is None:
+            return "no goal yet"
+        if state is None:
+            return "no object state yet"
+        if now - state.stamp > self.config.object_timeout:
+            return f"the object's state is {now - state.stamp:.2f} s old (allowed {self.config.object_timeout:.2f} s)"
+        if not self.config.workspace.contains_object(np.append(goal.position, 0.0)):
+            return f"the goal ({goal.position[0]:.3f}, {goal.position[1]:.3f}) m is outside the workspace"
+        return ""
+
+    def _object_at(self, when: float, state: ObjectState) -> NDArray:
+        """Object pose at `when`: rolled out along the running reference since the estimate's time (latency compensation)."""
+        times = np.linspace(min(state.stamp, when), when, 8)
+        path = self.table_map.tool(self.reference(times)) + self.tool_offset
+        return rollout(self.model, state.pose, path[None]).object_pose[0, -1]
+
+    def _goal_reached(self, pose: NDArray, goal: PlanarGoal) -> bool:
+        """Hysteresis: rest within the hold distance until the object is beyond the resume distance."""
+        error = float(goal.error(pose, self.model.pressure_radius))
+        self.holding = error <= (self.config.resume_distance if self.holding else self.config.hold_distance)
+        return self.holding
+
+    def _plan(
+        self, now: float, pose: NDArray, goal: PlanarGoal, contact: ContactPlan | None, deadline: float | None, clock: Callable[[], float]
+    ) -> MpcStep:
+        problem = self._problem(now, pose, goal, contact)
+        result = self.online.step(problem, deadline=deadline, clock=clock)
+        if result.trajectory is None:
+            return self._stop(now, "brake", f"no valid plan ({result.search.status})")
+        try:
+            return self._joint_step(now, problem, result)
+        except InfeasibleError as error:
+            return self._stop(now, "brake", f"plan refused: {error}")
+
+    def _problem(self, now: float, pose: NDArray, goal: PlanarGoal, contact: ContactPlan | None) -> PushingProblem:
+        takeover = now + self.config.lead
+        position, velocity, _ = self.reference.state(takeover)
+        tool = self.table_map.tool(position)
+        tool_velocity = self.table_map.tool_velocity(position, velocity)
+        pushes = self.ranking.rank(self.model, pose, goal, tool + self.tool_offset)
+        return PushingProblem(
+            self.model, self.config.costs, self.config.workspace, self.limits,
+            start=tool, velocity=np.clip(tool_velocity, -self.limits.velocity, self.limits.velocity), start_time=takeover,
+            tool_offset=self.tool_offset, pose=pose, goal=goal, contact=contact,
+            pushes=pushes.diverse(self.config.seeds, self.config.seed_separation),
+        )  # fmt: skip
+
+    def _joint_step(self, now: float, problem: PushingProblem, result: OnlineResult) -> MpcStep:
+        plane = result.trajectory
+        position, velocity, _ = self.reference.state(problem.start_time)
+        joints = self.table_path.joints(plane, position, velocity)
+        keys = plane(np.linspace(plane.start_time, plane.end_time, 40))
+        poses = rollout(self.model, problem.pose, (keys + self.tool_offset)[None]).object_pose[0]
+        iterations = result.search.iterations if result.search else 0
+        trajectory = self._joined(now, joints)
+        return MpcStep(trajectory, result.mode, True, "pushing", result.cost, keys, poses, iterations, plane)
+
+    def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
+        """Come to rest gently: in the plane, a straight line with constant deceleration (a free end without via-points)."""
+        takeover = now + self.config.lead
+        position, velocity, _ = self.reference.state(takeover)
+        if np.abs(velocity).max() < 1e-6:
+            return MpcStep(self._joined(now, resting(position, takeover, takeover + 0.5)), mode, valid, message)
+        tool = self.table_map.tool(position)
+        plane = braking_trajectory(tool, self.table_map.tool_velocity(position, velocity), self.limits, start_time=takeover)
+        try:
+            joints = self.table_path.joints(plane, position, velocity)
+        except InfeasibleError:
+            joints = braking_trajectory(position, velocity, self.robot.limits, start_time=takeover)
+        return MpcStep(self._joined(now, joints), mode, valid, message)
+
+    def _joined(self, now: float, joints: Trajectory) -> Trajectory:
+        """The running reference until the new motion takes over, then the new motion."""
+        running = extended(self.reference, joints.start_time)
+        begin = max(now, running.start_time)
+        if joints.start_time - begin < 1e-6:
+            return joints
+        return running.clipped(begin, joints.start_time).followed_by(joints)
+
+
+def _check_workspace(config: PushingMpcConfig, table_map: TableMap) -> None:
+    """Refuse a workspace that the arm does not reach with the tool upright."""
+    low, high = table_map.radius_range
+    space = config.workspace
+    if space.radius_min < low or space.radius_max > high:
+        raise ConfigurationError(
+            f"workspace.radius_min = {space.radius_min}, workspace.radius_max = {space.radius_max} m; the arm reaches {low:.3f} to {high:.3f} m"
+        )
