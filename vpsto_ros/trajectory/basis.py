@@ -1,4 +1,4 @@
-"""Optimal basis functions: the minimal-effort trajectory as a linear map of its key positions (section 3.1)."""
+"""Optimal basis functions: the minimal-effort trajectory, linear in its key positions (section 3.1)."""
 
 import dataclasses
 import functools
@@ -15,10 +15,10 @@ _SMALLEST_GAP = 1e-9
 class OptimalBasis:
     """Basis functions of the minimal-effort trajectory through N via-points (eqs. 3.1-3.12).
 
-    Minimising the integral of q''(s)^2 under (3.2)-(3.4) gives the C2 cubic spline with clamped end slopes through
-    the key positions, linear in w = (q_0, q_1 .. q_N, q_T, q'_0, q'_T). The thesis chains double-integrator
-    segments (3.6)-(3.10); here the same spline is found from the tridiagonal system for the slopes at the knots.
-    Every degree of freedom has the same basis, so w may carry any number of columns.
+    Minimising the integral of q''(s)^2 under (3.2)-(3.4) gives the C2 cubic spline with clamped end slopes
+    through the key positions, linear in w = (q_0, q_1 .. q_N, q_T, q'_0, q'_T). The thesis chains
+    double-integrator segments (3.6)-(3.10); here the same spline is found from the tridiagonal system for the
+    slopes at the knots. Every degree of freedom has the same basis, so w may carry any number of columns.
 
     Deviation: the thesis counts the final position among its N key positions; here N counts the via-points
     strictly between start and end, so w has N + 4 entries.
@@ -43,7 +43,9 @@ class OptimalBasis:
     def __post_init__(self) -> None:
         phases = np.array(self.phases, dtype=np.float64)
         if phases.ndim != 1 or phases.size == 0 or not np.all(np.isfinite(phases)) or phases[-1] != 1.0:
-            raise InvalidInputError(f"phases must be a vector of finite numbers that ends with 1.0, got {self.phases}")
+            raise InvalidInputError(
+                f"phases must be a vector of finite numbers that ends with 1.0, got {self.phases}"
+            )
         knots = np.concatenate(([0.0], phases))
         if np.any(np.diff(knots) < _SMALLEST_GAP):
             raise InvalidInputError(f"phases must increase strictly between 0 and 1, got {phases}")
@@ -59,7 +61,7 @@ class OptimalBasis:
             object.__setattr__(self, name, array)
 
     @staticmethod
-    @functools.lru_cache(maxsize=64)
+    @functools.lru_cache(maxsize=256)
     def uniform(n_via: int) -> "OptimalBasis":
         """The basis with N via-points equally spaced in phase; N = 0 joins start and end directly.
 
@@ -95,7 +97,12 @@ class OptimalBasis:
         h = np.diff(self.knots)[segment]
         position = np.eye(self.n_via + 2, self.n_via + 4)
         weights = _hermite_weights(u, h, order)
-        terms = (position[segment], position[segment + 1], self.knot_slopes[segment], self.knot_slopes[segment + 1])
+        terms = (
+            position[segment],
+            position[segment + 1],
+            self.knot_slopes[segment],
+            self.knot_slopes[segment + 1],
+        )
         return sum(weight[:, None] * term for weight, term in zip(weights, terms, strict=True))
 
     def gramian(self) -> NDArray[np.float64]:
@@ -106,7 +113,9 @@ class OptimalBasis:
         h = np.diff(self.knots)[:, None, None]
         left, right = self.knot_curvatures[:-1, :, None], self.knot_curvatures[1:, :, None]
         left_t, right_t = left.transpose(0, 2, 1), right.transpose(0, 2, 1)
-        return np.sum(h / 6.0 * (2 * left * left_t + 2 * right * right_t + left * right_t + right * left_t), axis=0)
+        return np.sum(
+            h / 6.0 * (2 * left * left_t + 2 * right * right_t + left * right_t + right * left_t), axis=0
+        )
 
 
 def locate(basis: OptimalBasis, s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -133,7 +142,7 @@ def _knot_slopes(knots: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _knot_curvatures(knots: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """q'' at the left end of every segment, and at the right end of the last one."""
+    """Second derivative at the left end of every segment, and at the right end of the last one."""
     h = np.diff(knots)[:, None]
     position = np.eye(knots.size, knots.size + 2)
     chord = np.diff(position, axis=0) / h
@@ -143,7 +152,7 @@ def _knot_curvatures(knots: NDArray[np.float64], slopes: NDArray[np.float64]) ->
 
 
 def _hermite_weights(u: NDArray, h: NDArray, order: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Weights of (q_i, q_i+1, q'_i, q'_i+1) for the order-th derivative in phase of the cubic Hermite segment."""
+    """Weights of (q_i, q_i+1, q'_i, q'_i+1) in the order-th derivative of a cubic Hermite segment."""
     one = np.ones_like(u)
     if order == 0:
         rise, out, back = u * u * (3 - 2 * u), u * (1 - u) ** 2, -u * u * (1 - u)

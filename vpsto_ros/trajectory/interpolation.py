@@ -24,7 +24,8 @@ def hermite_coefficients(
         accelerations: (P, n), rows of NaN where there are none, or None.
 
     Raises:
-        InvalidInputError: if shapes do not fit, times do not increase or accelerations come without velocities.
+        InvalidInputError: if shapes do not fit, times do not increase or accelerations come without
+            velocities.
     """
     q = _matrix("positions", positions, times.size)
     if times.size < 2 or not np.all(np.diff(times) > 0.0):
@@ -50,8 +51,8 @@ def hermite_coefficients(
 def _raise_to_quintic(c: NDArray, h: NDArray, q: NDArray, v: NDArray, a: NDArray) -> None:
     """Bring the cubics c (S, 6, n) to accelerations a (S + 1, n) in place, where both ends have them.
 
-    Written as a correction of the cubic: e_0 and e_1, the accelerations still missing at the two ends, enter as
-    h^2 / 2 (e_0 u^2 (1 - u)^3 + e_1 u^3 (1 - u)^2). What is missing only by round-off is no quintic.
+    Written as a correction of the cubic: e_0 and e_1, the accelerations still missing at the two ends, enter
+    as h^2 / 2 (e_0 u^2 (1 - u)^3 + e_1 u^3 (1 - u)^2). What is missing only by round-off is no quintic.
     """
     given = np.isfinite(a).all(axis=1)
     quintic = (given[:-1] & given[1:])[:, None]

@@ -1,7 +1,9 @@
-"""Compiled kernels of the minimal duration and of the batch synthesis; see :mod:`vpsto_ros.trajectory.timing`.
+"""Compiled kernels of the minimal duration and of the batch synthesis (section 3.2.1).
 
-Notation on one segment of phase length h, with local coordinate u in [0, 1]: a velocity profile that runs from slope
-a0 to slope a1 with mean (chord) c is the quadratic a0 + (6c - 4a0 - 2a1) u + (3a0 + 3a1 - 6c) u^2.
+The derivation is in :func:`vpsto_ros.trajectory.minimal_duration`. Notation on one segment of phase length h,
+with local coordinate u in [0, 1]: a velocity profile that runs from slope a0 to slope a1 with the mean c (its
+chord) is the quadratic a0 + (6c - 4a0 - 2a1) u + (3a0 + 3a1 - 6c) u^2. For alpha the mean is that of the key
+positions, for beta it is zero. Swapping the two ends of a segment gives the same profile backwards.
 """
 
 import math
@@ -18,7 +20,7 @@ BOUNDARY_TOLERANCE = 1e-9
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _slopes(knot_slopes, keys, start, end, alpha, beta):
-    """Slopes at the knots: alpha from the key positions, beta from the boundary velocities per unit duration."""
+    """Slopes at the knots: alpha from the key positions, beta from the boundary velocities over duration."""
     size, dof = keys.shape
     for i in range(size):
         for j in range(dof):
@@ -33,7 +35,7 @@ def _slopes(knot_slopes, keys, start, end, alpha, beta):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _acceleration_bound(duration, a, b, limit):
-    """Largest root of limit T^2 - b T - a, if above the duration: beyond it a / T^2 + b / T <= limit for good."""
+    """The duration, or the largest root of limit T^2 - b T - a if longer: the limit holds from there on."""
     if limit * duration * duration - b * duration - a >= 0.0 and 2.0 * limit * duration >= b:
         return duration
     discriminant = b * b + 4.0 * limit * a
@@ -45,12 +47,23 @@ def _acceleration_bound(duration, a, b, limit):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ratio_bound(duration, a0, a1, chord, b0, b1, limit, reach):
-    """Raise the duration to the interior maximum of alpha(u) / (limit - beta(u)) on 0 < u <= reach, if it is larger.
+def _end_velocity_bound(duration, a0, a1, c, b0, b1, limit):
+    """The duration, or alpha / (limit - beta) at u = 0 if longer."""
+    gap = limit - b0
+    if gap > 0.0:
+        return max(duration, a0 / gap)
+    # A boundary velocity on its limit (alpha is zero there): 0/0, whose limit value is the ratio of the slopes.
+    rise, fall = 6.0 * c - 4.0 * a0 - 2.0 * a1, 4.0 * b0 + 2.0 * b1
+    return max(duration, rise / fall)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inner_velocity_bound(duration, a0, a1, c, b0, b1, limit, reach):
+    """The duration, or the maximum of alpha(u) / (limit - beta(u)) on 0 < u <= reach if longer.
 
     Both ends of the segment must already be feasible at this duration.
     """
-    p1, p2 = 6.0 * chord - 4.0 * a0 - 2.0 * a1, 3.0 * (a0 + a1) - 6.0 * chord
+    p1, p2 = 6.0 * c - 4.0 * a0 - 2.0 * a1, 3.0 * (a0 + a1) - 6.0 * c
     g0, g1, g2 = max(limit - b0, 0.0), 4.0 * b0 + 2.0 * b1, -3.0 * (b0 + b1)
     # Cheap test: with feasible ends, alpha - T (limit - beta) is positive somewhere only at an inner vertex.
     r0, r1, r2 = a0 - duration * g0, p1 - duration * g1, p2 - duration * g2
@@ -71,53 +84,65 @@ def _ratio_bound(duration, a0, a1, chord, b0, b1, limit, reach):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _end_bound(duration, a0, a1, chord, b0, b1, limit):
-    """Feasibility at u = 0, where a0 = 0 at the very start and end: 0/0 there when the velocity is on the limit."""
-    gap = limit - b0
-    if gap > 0.0:
-        return max(duration, a0 / gap)
-    rise, fall = 6.0 * chord - 4.0 * a0 - 2.0 * a1, 4.0 * b0 + 2.0 * b1
-    return max(duration, rise / fall)
+def _end_bound(duration, h, a0, a1, c, b0, b1, velocity, acceleration):
+    """The shortest duration, not below the given one, that keeps both limits at u = 0 from there on."""
+    a, b = (6.0 * c - 4.0 * a0 - 2.0 * a1) / h, (-4.0 * b0 - 2.0 * b1) / h
+    spare = velocity - abs(b0)
+    slow = spare > 0.0 and abs(a0) <= duration * spare
+    if (
+        slow
+        and abs(a + duration * b) <= acceleration * duration**2
+        and abs(b) <= 2.0 * acceleration * duration
+    ):
+        return duration
+    for sign in (1.0, -1.0):
+        duration = _acceleration_bound(duration, sign * a, sign * b, acceleration)
+        duration = _end_velocity_bound(
+            duration, sign * a0, sign * a1, sign * c, sign * b0, sign * b1, velocity
+        )
+    return duration
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inner_bound(duration, a0, a1, c, b0, b1, velocity, reach):
+    """The shortest duration, not below the given one, that keeps the velocity limit inside a segment."""
+    # The middle control point of the Bernstein form, together with the two feasible ends, bounds the velocity.
+    if abs(3.0 * c - a0 - a1 - duration * (b0 + b1)) <= duration * velocity:
+        return duration
+    for sign in (1.0, -1.0):
+        duration = _inner_velocity_bound(
+            duration, sign * a0, sign * a1, sign * c, sign * b0, sign * b1, velocity, reach
+        )
+    return duration
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _minimal_duration(knots, keys, start, end, alpha, beta, velocity, acceleration):
-    last, dof = keys.shape[0] - 1, keys.shape[1]
+    last, dof = keys.shape[0] - 2, keys.shape[1]
     for j in range(dof):
         if max(abs(start[j]), abs(end[j])) > velocity[j] * (1.0 + BOUNDARY_TOLERANCE):
             return np.inf
     duration = MINIMUM_DURATION
-    for i in range(last):
+    for i in range(last + 1):
         h = knots[i + 1] - knots[i]
         for j in range(dof):
             a0, a1, b0, b1 = alpha[i, j], alpha[i + 1, j], beta[i, j], beta[i + 1, j]
-            c, v, limit = (keys[i + 1, j] - keys[i, j]) / h, velocity[j], acceleration[j]
-            a, b = (6.0 * c - 4.0 * a0 - 2.0 * a1) / h, (-4.0 * b0 - 2.0 * b1) / h
-            duration = _acceleration_bound(duration, a, b, limit)
-            duration = _acceleration_bound(duration, -a, -b, limit)
-            duration = _end_bound(duration, a0, a1, c, b0, b1, v)
-            duration = _end_bound(duration, -a0, -a1, -c, -b0, -b1, v)
-            if i == last - 1:
-                a, b = (2.0 * a0 + 4.0 * a1 - 6.0 * c) / h, (2.0 * b0 + 4.0 * b1) / h
-                duration = _acceleration_bound(duration, a, b, limit)
-                duration = _acceleration_bound(duration, -a, -b, limit)
-                duration = _end_bound(duration, a1, a0, c, b1, b0, v)
-                duration = _end_bound(duration, -a1, -a0, -c, -b1, -b0, v)
-    # Only now, with all ends feasible, the cheap test inside is valid.
-    for i in range(last):
+            c = (keys[i + 1, j] - keys[i, j]) / h
+            duration = _end_bound(duration, h, a0, a1, c, b0, b1, velocity[j], acceleration[j])
+            if i == last:
+                duration = _end_bound(duration, h, a1, a0, c, b1, b0, velocity[j], acceleration[j])
+    # A second pass: the tests for the inside of a segment need its two ends to be feasible. Near an end on the
+    # limit alpha and limit - beta both vanish, so u counts from that end, and from both in a lone segment.
+    reach = 0.5 if last == 0 else 1.0
+    for i in range(last + 1):
         h = knots[i + 1] - knots[i]
         for j in range(dof):
             a0, a1, b0, b1 = alpha[i, j], alpha[i + 1, j], beta[i, j], beta[i + 1, j]
-            c, v = (keys[i + 1, j] - keys[i, j]) / h, velocity[j]
-            # Near an end on the limit numerator and denominator both vanish: count u from that end.
-            if i < last - 1 or last == 1:
-                reach = 0.5 if last == 1 else 1.0
-                duration = _ratio_bound(duration, a0, a1, c, b0, b1, v, reach)
-                duration = _ratio_bound(duration, -a0, -a1, -c, -b0, -b1, v, reach)
-            if i == last - 1:
-                reach = 0.5 if last == 1 else 1.0
-                duration = _ratio_bound(duration, a1, a0, c, b1, b0, v, reach)
-                duration = _ratio_bound(duration, -a1, -a0, -c, -b1, -b0, v, reach)
+            c = (keys[i + 1, j] - keys[i, j]) / h
+            if i < last or last == 0:
+                duration = _inner_bound(duration, a0, a1, c, b0, b1, velocity[j], reach)
+            if i == last:
+                duration = _inner_bound(duration, a1, a0, c, b1, b0, velocity[j], reach)
     return duration
 
 
@@ -135,7 +160,7 @@ def durations_kernel(knots, knot_slopes, keys, start, end, velocity, acceleratio
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cubic_segments(knots, keys, alpha, beta, duration, cubic):
-    """Coefficients (N + 1, 4, n) in u of every segment; a row of infinite duration stands still."""
+    """Coefficients (N + 1, 4, n) in u of every segment."""
     for i in range(cubic.shape[0]):
         h = knots[i + 1] - knots[i]
         for j in range(cubic.shape[2]):
@@ -150,31 +175,27 @@ def _cubic_segments(knots, keys, alpha, beta, duration, cubic):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleration, segment, u, derivatives):
-    """Minimal durations (B,) and samples (B, K, n) of position, velocity and acceleration."""
+    """Minimal durations (B,) and samples (3, B, K, n) of position, velocity and acceleration, or (1, B, K, n)."""
     batch, size, dof = keys.shape
-    samples = u.size
-    rows = batch if derivatives else 0
     duration = np.empty(batch)
-    q, qd, qdd = np.empty((batch, samples, dof)), np.empty((rows, samples, dof)), np.empty((rows, samples, dof))
+    # One block: the allocator hands large separate ones back to the system, and page faults then cost more than
+    # all the arithmetic.
+    out = np.zeros((3 if derivatives else 1, batch, u.size, dof))
     alpha, beta, cubic = np.empty((size, dof)), np.empty((size, dof)), np.empty((size - 1, 4, dof))
     for b in range(batch):
         _slopes(knot_slopes, keys[b], start[b], end[b], alpha, beta)
         duration[b] = _minimal_duration(knots, keys[b], start[b], end[b], alpha, beta, velocity, acceleration)
         if duration[b] == np.inf:
-            q[b] = keys[b, 0]
-            if derivatives:
-                qd[b] = 0.0
-                qdd[b] = 0.0
+            out[0, b] = keys[b, 0]
             continue
         _cubic_segments(knots, keys[b], alpha, beta, duration[b], cubic)
-        for k in range(samples):
+        for k in range(u.size):
             i, x = segment[k], u[k]
+            rate = 1.0 / ((knots[i + 1] - knots[i]) * duration[b])
             for j in range(dof):
-                q[b, k, j] = cubic[i, 0, j] + x * (cubic[i, 1, j] + x * (cubic[i, 2, j] + x * cubic[i, 3, j]))
-            if derivatives:
-                rate = 1.0 / ((knots[i + 1] - knots[i]) * duration[b])
-                for j in range(dof):
-                    c1, c2, c3 = cubic[i, 1, j], cubic[i, 2, j], cubic[i, 3, j]
-                    qd[b, k, j] = rate * (c1 + x * (2.0 * c2 + x * 3.0 * c3))
-                    qdd[b, k, j] = rate * rate * (2.0 * c2 + x * 6.0 * c3)
-    return duration, q, qd, qdd
+                c1, c2, c3 = cubic[i, 1, j], cubic[i, 2, j], cubic[i, 3, j]
+                out[0, b, k, j] = cubic[i, 0, j] + x * (c1 + x * (c2 + x * c3))
+                if derivatives:
+                    out[1, b, k, j] = rate * (c1 + x * (2.0 * c2 + x * 3.0 * c3))
+                    out[2, b, k, j] = rate * rate * (2.0 * c2 + x * 6.0 * c3)
+    return duration, out

@@ -1,6 +1,7 @@
 """Compiled kernels on piecewise polynomials of degree 5: evaluation and exact extrema.
 
-Coefficients (S, 6, n) are those of c_0 + c_1 tau + .. + c_5 tau^5 with tau the time since the start of the segment.
+Coefficients (S, 6, n) are those of c_0 + c_1 tau + .. + c_5 tau^5 with tau the time since the start of the
+segment.
 """
 
 import math
@@ -27,7 +28,7 @@ def _locate(times, t):
 
 @njit(cache=True, nogil=True)
 def _falling(k, order):
-    """k (k - 1) .. (k - order + 1): the factor of tau^(k - order) in the derivative of tau^k."""
+    """Factor k (k - 1) .. (k - order + 1) of tau^(k - order) in the derivative of tau^k."""
     product = 1.0
     for i in range(order):
         product *= k - i
@@ -79,7 +80,7 @@ def evaluate_state(times, coefficients, t):
 
 @njit(cache=True, nogil=True)
 def shifted_origin(coefficients, tau):
-    """Coefficients (6, n) of the same polynomials (6, n) about tau instead of 0 (repeated synthetic division)."""
+    """Coefficients (6, n) of the same polynomials about tau instead of 0, by repeated synthetic division."""
     out = coefficients.copy()
     for first in range(SIZE - 1):
         for k in range(SIZE - 2, first - 1, -1):
@@ -117,7 +118,7 @@ def _quadratic_roots(p, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bracketed_root(p, degree, a, b, value_a):
-    """Root of a polynomial that is monotone on [a, b] with a change of sign: Newton, kept inside by bisection."""
+    """Root of a polynomial, monotone on [a, b] with a change of sign: Newton, kept inside by bisection."""
     low, high = (a, b) if value_a < 0.0 else (b, a)
     u = 0.5 * (a + b)
     for _ in range(60):
@@ -144,9 +145,9 @@ def _bracketed_root(p, degree, a, b, value_a):
 def _unit_roots(p, degree, roots, ends, scratch):
     """Sorted roots in (0, 1) where a polynomial of degree <= 4 changes sign; returns how many.
 
-    The roots of the quadratic derivative are known in closed form; between the roots of its derivative a polynomial
-    is monotone, which brackets its own roots, one degree after the other. Touching roots may be missed; a derivative
-    that touches zero marks no extremum.
+    The roots of the quadratic derivative are known in closed form; between the roots of its derivative a
+    polynomial is monotone, which brackets its own roots, one degree after the other. Touching roots may be
+    missed; a derivative that touches zero marks no extremum.
     """
     while degree > 0 and p[degree] == 0.0:
         degree -= 1
@@ -206,7 +207,8 @@ def _unit_derivative(coefficients, i, j, order, h, p):
 def extrema_kernel(times, coefficients, order):
     """Least and greatest value (2, n) of a time derivative over all instants.
 
-    First the ends of all segments; then only segments whose Bernstein hull reaches further are searched inside.
+    First the ends of all segments; then only segments whose Bernstein hull reaches further are searched
+    inside.
     """
     segments, dof = coefficients.shape[0], coefficients.shape[2]
     degree = SIZE - 1 - order

@@ -56,7 +56,8 @@ def synthesize(
         broken = trajectory.violations(dataclasses.replace(limits, lower=None, upper=None))
         if broken:
             raise InfeasibleError(
-                f"duration {total:.6g} s is too short ({'; '.join(broken)}); every duration from {shortest:.6g} s on works"
+                f"duration {total:.6g} s is too short ({'; '.join(broken)}); "
+                f"every duration from {shortest:.6g} s on works"
             )
     return trajectory
 
@@ -66,9 +67,10 @@ def braking_trajectory(
 ) -> Trajectory:
     """Come to rest with constant deceleration, on a straight line, as fast as the acceleration limits allow.
 
-    The treatment of a start velocity beyond its limit, for which :func:`synthesize` finds no trajectory: every
-    speed falls linearly to zero within T = max_i |v_i| / a_i, so what exceeds its limit at the start only shrinks.
-    Position limits are not looked at: the way to rest is |v_i| T / 2, and there is no shorter one for the joint that sets T.
+    The treatment of a start velocity beyond its limit, for which :func:`synthesize` finds no trajectory:
+    every speed falls linearly to zero within T = max_i |v_i| / a_i, so what exceeds its limit at the start
+    only shrinks. Position limits are not looked at: the way to rest is |v_i| T / 2, and there is no shorter
+    one for the joint that sets T.
 
     Args:
         position: (n,) position at the start [rad or m].
@@ -81,7 +83,9 @@ def braking_trajectory(
     """
     q, v = np.array(position, dtype=np.float64), np.array(velocity, dtype=np.float64)
     if q.shape != (limits.dof,) or v.shape != (limits.dof,):
-        raise InvalidInputError(f"position and velocity must have shape ({limits.dof},), got {q.shape} and {v.shape}")
+        raise InvalidInputError(
+            f"position and velocity must have shape ({limits.dof},), got {q.shape} and {v.shape}"
+        )
     if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise InvalidInputError("position and velocity must be finite")
     duration = max(MINIMUM_DURATION, float(np.max(np.abs(v) / limits.acceleration)))
@@ -94,6 +98,7 @@ def _beyond_limit(start_velocity: ArrayLike, end_velocity: ArrayLike, limits: Li
     speeds: NDArray = np.maximum(np.abs(start_velocity), np.abs(end_velocity))
     joint = int(np.argmax(speeds / limits.velocity))
     return (
-        f"boundary speed {speeds[joint]:.6g} of joint {joint + 1} is beyond its limit {limits.velocity[joint]:.6g}: "
+        f"boundary speed {speeds[joint]:.6g} of joint {joint + 1} is beyond its limit "
+        f"{limits.velocity[joint]:.6g}: "
         "no duration keeps the limits; slow down first with braking_trajectory"
     )

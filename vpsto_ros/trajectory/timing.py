@@ -19,7 +19,8 @@ class Limits:
     """Symmetric velocity and acceleration limits, and the position range, of n degrees of freedom.
 
     Symmetric because only then a duration exists for every pair of boundary velocities within the limits: the
-    element-wise bound (3.20) does not hold, only |q̇| <= max(|q̇_0|, |q̇_T|) does (see :func:`minimal_duration`).
+    element-wise bound (3.20) does not hold, only |q̇| <= max(|q̇_0|, |q̇_T|) does (see
+    :func:`minimal_duration`).
 
     Args:
         velocity: (n,) largest |q̇| [rad/s or m/s], positive; infinite where there is no limit.
@@ -43,7 +44,9 @@ class Limits:
                 continue
             array = np.array(value, dtype=np.float64)
             if array.ndim != 1 or array.size == 0 or array.size != np.size(self.velocity):
-                raise InvalidInputError(f"limits: {name} must have one entry per degree of freedom, got {value!r}")
+                raise InvalidInputError(
+                    f"limits: {name} must have one entry per degree of freedom, got {value!r}"
+                )
             if np.any(np.isnan(array)):
                 raise InvalidInputError(f"limits: {name} must not be NaN, got {value!r}")
             array.setflags(write=False)
@@ -87,16 +90,18 @@ def minimal_duration(
 ) -> NDArray[np.float64] | float:
     """The smallest duration above which every longer one is feasible (eqs. 3.16-3.26), in closed form.
 
-    Velocity, at every instant: on a segment q̇(s; T) = alpha(s) / T + beta(s) with two quadratics, alpha from the key
-    positions and beta from the boundary velocities. The limit ±v holds for all T >= sup_s ±alpha / (v ∓ beta)
-    (eq. 3.21 with its sign corrected); the stationary points of that ratio solve a quadratic, so no grid of phases
-    is needed. |beta| <= max(|q̇_0|, |q̇_T|) holds for every choice of phases: the slopes at inner knots are at most
-    half of that by diagonal dominance, and between knots |(1-u)(1-3u)| + |u(3u-2)| <= 1. Hence v ∓ beta > 0 inside,
-    and 0/0 arises only where a boundary velocity is on the limit; its limit value is a ratio of slopes.
+    Velocity, at every instant: on a segment q̇(s; T) = alpha(s) / T + beta(s) with two quadratics, alpha from
+    the key positions and beta from the boundary velocities. The limit ±v holds for all T >= sup_s ±alpha / (v
+    ∓ beta) (eq. 3.21 with its sign corrected); the stationary points of that ratio solve a quadratic, so no
+    grid of phases is needed. |beta| <= max(|q̇_0|, |q̇_T|) holds for every choice of phases: the slopes at
+    inner knots are at most half of that by diagonal dominance, and between knots |(1-u)(1-3u)| + |u(3u-2)| <=
+    1. Hence v ∓ beta > 0 inside, and 0/0 arises only where a boundary velocity is on the limit; its limit
+    value is a ratio of slopes.
 
-    Acceleration: q̈ = A / T^2 + B / T is linear in phase between knots, so the knots suffice; the largest root of
-    each quadratic is taken (eq. 3.24 with w_q̇ in the linear term). Shorter isolated feasible durations can exist;
-    they are passed over, as in the thesis, so that stretching a result never breaks a limit.
+    Acceleration: q̈ = A / T^2 + B / T is linear in phase between knots, so the knots suffice; the largest
+        root of each quadratic is taken (eq. 3.24 with w_q̇ in the linear term). Shorter isolated feasible
+        durations can exist; they are passed over, as in the thesis, so that stretching a result never breaks
+        a limit.
 
     Args:
         basis: optimal basis with N via-points.
@@ -106,14 +111,16 @@ def minimal_duration(
         limits: velocity and acceleration limits; position limits play no part here.
 
     Returns:
-        (B,) durations, or one float for (N + 2, n) input [s]; inf where a boundary velocity exceeds its limit (by more
-        than 1e-9 relative); at least MINIMUM_DURATION, which is what standing still takes.
+        (B,) durations, or one float for (N + 2, n) input [s]; inf where a boundary velocity exceeds its limit
+        (by more than 1e-9 relative); at least MINIMUM_DURATION, which is what standing still takes.
 
     Raises:
         InvalidInputError: if shapes do not fit or an entry is not finite.
     """
     keys, start, end = _prepare(basis, key_positions, start_velocity, end_velocity, limits)
-    duration = durations_kernel(basis.knots, basis.knot_slopes, keys, start, end, limits.velocity, limits.acceleration)
+    duration = durations_kernel(
+        basis.knots, basis.knot_slopes, keys, start, end, limits.velocity, limits.acceleration
+    )
     return float(duration[0]) if np.ndim(key_positions) == 2 else duration
 
 
@@ -143,19 +150,31 @@ def synthesize_batch(
     """
     keys, start, end = _prepare(basis, key_positions, start_velocity, end_velocity, limits)
     segment, u = _sample_grid(basis, samples)
-    duration, position, velocity, acceleration = synthesis_kernel(
-        basis.knots, basis.knot_slopes, keys, start, end, limits.velocity, limits.acceleration, segment, u, derivatives
+    duration, samples_of = synthesis_kernel(
+        basis.knots,
+        basis.knot_slopes,
+        keys,
+        start,
+        end,
+        limits.velocity,
+        limits.acceleration,
+        segment,
+        u,
+        derivatives,
     )
     if not derivatives:
-        return TrajectoryBatch(duration, position, None, None, keys)
-    return TrajectoryBatch(duration, position, velocity, acceleration, keys)
+        return TrajectoryBatch(duration, samples_of[0], None, None, keys)
+    return TrajectoryBatch(duration, samples_of[0], samples_of[1], samples_of[2], keys)
 
 
 @functools.lru_cache(maxsize=64)
 def _sample_grid(basis: OptimalBasis, samples: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     if samples < 2:
         raise InvalidInputError(f"samples must be at least 2, got {samples}")
-    return locate(basis, np.linspace(0.0, 1.0, samples))
+    segment, u = locate(basis, np.linspace(0.0, 1.0, samples))
+    segment.setflags(write=False)
+    u.setflags(write=False)
+    return segment, u
 
 
 @njit(cache=True, nogil=True)
@@ -167,7 +186,11 @@ def _all_finite(values):
 
 
 def _prepare(
-    basis: OptimalBasis, key_positions: ArrayLike, start_velocity: ArrayLike, end_velocity: ArrayLike, limits: Limits
+    basis: OptimalBasis,
+    key_positions: ArrayLike,
+    start_velocity: ArrayLike,
+    end_velocity: ArrayLike,
+    limits: Limits,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Own, contiguous arrays: keys (B, N + 2, n) and boundary velocities (B, n)."""
     keys = np.array(key_positions, dtype=np.float64, order="C")
@@ -188,7 +211,9 @@ def _boundary(name: str, velocity: ArrayLike, keys: NDArray[np.float64]) -> NDAr
     given = np.asarray(velocity, dtype=np.float64)
     rows = np.empty((keys.shape[0], keys.shape[2]))
     if given.shape != rows.shape and given.shape != rows.shape[1:]:
-        raise InvalidInputError(f"{name} velocity must have shape {rows.shape[1:]} or {rows.shape}, got {given.shape}")
+        raise InvalidInputError(
+            f"{name} velocity must have shape {rows.shape[1:]} or {rows.shape}, got {given.shape}"
+        )
     rows[:] = given
     if not _all_finite(rows):
         raise InvalidInputError(f"{name} velocity must be finite")

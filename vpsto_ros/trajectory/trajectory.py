@@ -26,8 +26,8 @@ class Trajectory:
     """Piecewise polynomial of degree <= 5 in time for n degrees of freedom; immutable.
 
     Before its start and after its end the boundary position is held and derivatives are zero. Times are plain
-    seconds: count them from the start of a run, since doubles resolve only 2e-7 s at the size of Unix time, which
-    shifts the ends of segments by that much.
+    seconds: count them from the start of a run, since doubles resolve only 2e-7 s at the size of Unix time,
+        which shifts the ends of segments by that much.
 
     Args:
         times: (S + 1,) strictly increasing knots [s].
@@ -46,7 +46,11 @@ class Trajectory:
         object.__setattr__(self, "coefficients", coefficients)
         if times.ndim != 1 or times.size < 2:
             raise InvalidInputError(f"times must hold at least two knots, got shape {times.shape}")
-        if coefficients.ndim != 3 or coefficients.shape[:2] != (times.size - 1, SIZE) or coefficients.shape[2] == 0:
+        if (
+            coefficients.ndim != 3
+            or coefficients.shape[:2] != (times.size - 1, SIZE)
+            or coefficients.shape[2] == 0
+        ):
             raise InvalidInputError(
                 f"coefficients must have shape ({times.size - 1}, {SIZE}, n) for {times.size} knots, "
                 f"got {coefficients.shape}"
@@ -66,8 +70,9 @@ class Trajectory:
     ) -> "Trajectory":
         """Interpolate points as a joint_trajectory_controller does.
 
-        Quintic on segments whose both ends have accelerations, cubic Hermite on the others, linear if no velocities
-        are given at all. Where the accelerations are those of the cubic to round-off, the cubic comes out exactly.
+        Quintic on segments whose both ends have accelerations, cubic Hermite on the others, linear if no
+        velocities are given at all. Where the accelerations are those of the cubic to round-off, the cubic
+        comes out exactly.
 
         Args:
             times: (P,) strictly increasing [s], P >= 2.
@@ -129,11 +134,13 @@ class Trajectory:
         return position, velocity, acceleration
 
     def knots(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Positions, velocities and accelerations (S + 1, n) at the knots, right-continuous; the last from the left."""
+        """Position, velocity and acceleration (S + 1, n) at the knots; the last from the left."""
         return self(self.times, 0), self(self.times, 1), self(self.times, 2)
 
     def extrema(self, order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and greatest value (n,) of position, velocity or acceleration over all instants, exact to round-off.
+        """Least and greatest value (n,) of a derivative over all instants, exact to round-off.
+
+        Order 0 is position, 1 velocity, 2 acceleration.
 
         Raises:
             InvalidInputError: if the order is not 0, 1 or 2.
@@ -146,7 +153,8 @@ class Trajectory:
     def jumps(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Largest discontinuity (n,) of position and of velocity at the inner knots.
 
-        :meth:`violations` looks at the pieces between the knots; a step from one piece to the next shows here.
+        :meth:`violations` looks at the pieces between the knots; a step from one piece to the next shows
+        here.
         """
         after = self.knots()
         size = np.diff(self.times)[:, None]
@@ -167,11 +175,17 @@ class Trajectory:
             InvalidInputError: if the limits are for another number of degrees of freedom.
         """
         if limits.dof != self.dof:
-            raise InvalidInputError(f"limits are for {limits.dof} degrees of freedom, the trajectory has {self.dof}")
+            raise InvalidInputError(
+                f"limits are for {limits.dof} degrees of freedom, the trajectory has {self.dof}"
+            )
         found: list[str] = []
-        ranges = (limits.lower, limits.upper), (-limits.velocity, limits.velocity), (
-            -limits.acceleration,
-            limits.acceleration,
+        ranges = (
+            (limits.lower, limits.upper),
+            (-limits.velocity, limits.velocity),
+            (
+                -limits.acceleration,
+                limits.acceleration,
+            ),
         )
         for order, (least, most) in enumerate(ranges):
             if least is None and most is None:
@@ -215,14 +229,17 @@ class Trajectory:
             InvalidInputError: if the times do not join or the degrees of freedom differ.
         """
         if other.dof != self.dof:
-            raise InvalidInputError(f"cannot join trajectories of {self.dof} and {other.dof} degrees of freedom")
+            raise InvalidInputError(
+                f"cannot join trajectories of {self.dof} and {other.dof} degrees of freedom"
+            )
         if abs(other.start_time - self.end_time) > _JOIN_TOLERANCE:
             raise InvalidInputError(
-                f"the second trajectory starts at {other.start_time:.9f} s, the first ends at {self.end_time:.9f} s; "
-                "shift or clip one of them so that they join"
+                f"the second trajectory starts at {other.start_time:.9f} s, the first ends at "
+                f"{self.end_time:.9f} s; shift or clip one of them so that they join"
             )
         return Trajectory(
-            np.concatenate([self.times, other.times[1:]]), np.concatenate([self.coefficients, other.coefficients])
+            np.concatenate([self.times, other.times[1:]]),
+            np.concatenate([self.coefficients, other.coefficients]),
         )
 
     def shifted(self, dt: float) -> "Trajectory":
@@ -238,7 +255,7 @@ def _checked_time(t: float) -> float:
 
 
 def _frozen(values: ArrayLike) -> NDArray[np.float64]:
-    """A read-only C-contiguous array; copied unless it is one already, so that no caller can change it later."""
+    """A read-only C-contiguous array, copied unless it is one already: no caller can change it later."""
     array = np.asarray(values)
     if array.flags.writeable or not array.flags.c_contiguous or array.dtype != np.float64:
         array = np.array(values, dtype=np.float64, order="C")
