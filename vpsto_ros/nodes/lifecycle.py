@@ -1,0 +1,315 @@
+"""The lifecycle that all nodes share: parameters, autostart, timers, guarded subscriptions, a clean end."""
+
+import dataclasses
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import rclpy
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+from rclpy.utilities import remove_ros_args
+
+from vpsto_ros.configuration import option
+from vpsto_ros.exceptions import ConfigurationError, VpstoError
+from vpsto_ros.nodes.conversions import TimeBase
+from vpsto_ros.nodes.diagnostics import Complaints
+from vpsto_ros.nodes.parameters import check_change, declare_parameters, read_parameters
+
+# A best-effort publisher never reaches a reliable subscriber; the other way round works.
+EXTERNAL = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def reliable(depth: int) -> QoSProfile:
+    """Quality of service of a publisher whose messages shall arrive."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def best_effort(depth: int) -> QoSProfile:
+    """Quality of service of a publisher whose messages are soon outdated."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def latched(depth: int = 1) -> QoSProfile:
+    """Quality of service of a publisher whose last message reaches those who join later."""
+    return QoSProfile(
+        depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class NodeConfig:
+    """What every node can be told."""
+
+    autostart: bool = option(True, "configure and activate without being asked to")
+    base_frame: str = option("fr3_link0", "frame of all poses: the robot's base, z up, table at z = 0")
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node that is configured once from its parameters.
+
+    Subclasses set `default_config` and fill in :meth:`configure` (and, where needed, :meth:`on_time_reset`
+    and :meth:`stop`). Publishers, subscriptions and timers made with the methods of this class are silent
+    while the node is inactive and are removed by `cleanup`.
+    """
+
+    default_config: ClassVar[Any] = NodeConfig()
+    threads: ClassVar[int] = 1
+
+    def __init__(self, name: str, **arguments: Any) -> None:
+        """Declare the parameters.
+
+        Args:
+            name: default node name.
+            arguments: passed to rclpy's node.
+
+        Raises:
+            ConfigurationError: when a parameter is unknown, of the wrong type or out of range.
+        """
+        super().__init__(name, automatically_declare_parameters_from_overrides=True, **arguments)
+        self.failure: Exception | None = None
+        self.configured = False
+        self.active = False
+        self.complaints = Complaints(self.get_logger().warning)
+        self.time_base = TimeBase()
+        self._timers_kept: list[Timer] = []
+        self._subscriptions_kept: list[Any] = []
+        self._publishers_kept: list[Any] = []
+        self._time_jumped = threading.Event()
+        try:
+            declare_parameters(self, self.default_config)
+        except ConfigurationError:
+            self.destroy_node()
+            raise
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        threshold = JumpThreshold(
+            min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+        )
+        self._jump = self.get_clock().create_jump_callback(threshold, post_callback=self._on_jump)
+
+    # What subclasses fill in.
+
+    def configure(self, config: Any) -> None:
+        """Build everything from the configuration; kernels are compiled here, not in the first cycle."""
+
+    def stop(self) -> None:
+        """Bring whatever is in motion to rest; called before the node becomes inactive."""
+
+    def on_time_reset(self) -> None:
+        """Forget everything that carries a time: the clock went backwards because a simulation restarted."""
+
+    # What subclasses use.
+
+    def now(self) -> float:
+        """The node's time in the seconds of its time base [s]; handles a clock that went backwards."""
+        if self._time_jumped.is_set():
+            self._time_jumped.clear()
+            self.complaints.add("clock_reset", "the clock went backwards (a restart?): starting afresh")
+            self.on_time_reset()
+        return self.time_base.seconds(self.get_clock().now().to_msg())
+
+    def advertise(self, kind: type, topic: str, qos: QoSProfile) -> Any:
+        """A publisher that is silent while the node is inactive."""
+        publisher = self.create_lifecycle_publisher(kind, topic, qos)
+        self._publishers_kept.append(publisher)
+        return publisher
+
+    def subscribe(self, kind: type, topic: str, callback: Callable, qos: QoSProfile = EXTERNAL) -> None:
+        """Listen to a topic; a message that the callback refuses with a VpstoError is counted and logged."""
+
+        def receive(message: Any) -> None:
+            if not self.active:
+                return
+            try:
+                callback(message)
+            except VpstoError as error:
+                self.complaints.add(topic, f"{topic} refused: {error}")
+
+        self._subscriptions_kept.append(self.create_subscription(kind, topic, receive, qos))
+
+    def every(self, period: float, callback: Callable[[], None], group: CallbackGroup | None = None) -> None:
+        """Call back periodically in the node's time while the node is active.
+
+        Timers know nothing of the lifecycle: they are created stopped, started by `activate` and cancelled by
+        `deactivate`.
+        """
+        timer = self.create_timer(period, callback, callback_group=group)
+        timer.cancel()
+        self._timers_kept.append(timer)
+
+    def start(self) -> None:
+        """Configure and activate.
+
+        Raises:
+            Exception: what made a transition fail.
+        """
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                raise self.failure or RuntimeError("a lifecycle transition failed")
+
+    # Transitions, called by rclpy.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters and build everything."""
+        return self._transition(self._configure, state, super().on_configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start the timers."""
+        return self._transition(self._activate, state, super().on_activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Bring everything to rest and cancel the timers."""
+        return self._transition(self._deactivate, state, super().on_deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Remove what `configure` built."""
+        return self._transition(self._remove, state, super().on_cleanup)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Bring everything to rest and remove it."""
+        return self._transition(self._shut_down, state, super().on_shutdown)
+
+    def _transition(
+        self, action: Callable, state: LifecycleState, base: Callable
+    ) -> TransitionCallbackReturn:
+        try:
+            action()
+            return base(state)
+        except VpstoError as error:
+            self.failure = error
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            # rclpy swallows what a transition raises, so a bug would vanish without a trace.
+            self.failure = error
+            self.get_logger().fatal(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+
+    def _configure(self) -> None:
+        config = read_parameters(self, self.default_config)
+        simulated = self.get_parameter("use_sim_time").value
+        self.time_base = TimeBase(0 if simulated else self.get_clock().now().to_msg().sec)
+        try:
+            self.configure(config)
+        except Exception:
+            self._remove()
+            raise
+        self.configured = True
+
+    def _activate(self) -> None:
+        self.active = True
+        for timer in self._timers_kept:
+            timer.reset()
+
+    def _deactivate(self) -> None:
+        self.stop()
+        self.active = False
+        for timer in self._timers_kept:
+            timer.cancel()
+
+    def _shut_down(self) -> None:
+        if self.active:
+            self._deactivate()
+        self._remove()
+
+    def _remove(self) -> None:
+        self.configured = False
+        for timer in self._timers_kept:
+            self.destroy_timer(timer)
+        for subscription in self._subscriptions_kept:
+            self.destroy_subscription(subscription)
+        for publisher in self._publishers_kept:
+            self.destroy_lifecycle_publisher(publisher)
+        for kept in (self._timers_kept, self._subscriptions_kept, self._publishers_kept):
+            kept.clear()
+
+    def _on_jump(self, _jump: Any) -> None:
+        self._time_jumped.set()
+
+    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        own = [parameter.name for parameter in parameters if parameter.name != "use_sim_time"]
+        if own and self.configured:
+            reason = (
+                f"{', '.join(own)}: parameters are read when the node is configured, which it is already; "
+            )
+            reason += "to change them, deactivate it, clean it up, set them, configure and activate it again"
+            return SetParametersResult(successful=False, reason=reason)
+        return check_change(self.default_config, parameters)
+
+
+def run(node_class: Callable[[], ManagedNode], args: list[str] | None = None) -> int:
+    """Run one node until it is told to stop.
+
+    Args:
+        node_class: makes the node.
+        args: command line with ROS arguments, the process's own when None.
+
+    Returns:
+        Exit status: 0 after a clean end, 2 after wrong parameters or arguments.
+    """
+    if not _initialize(args):
+        return 2
+    node = None
+    try:
+        node = _create(node_class)
+        if node is None:
+            return 2
+        return _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except Exception:
+        # What publishes or waits while a signal takes the context away ends in an error that means nothing.
+        if rclpy.ok():
+            raise
+        return 0
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _initialize(args: list[str] | None) -> bool:
+    given = sys.argv if args is None else args
+    try:
+        unknown = remove_ros_args(given)[1:]
+        if unknown:
+            raise ValueError(
+                f"unknown arguments {' '.join(unknown)}; set parameters by --ros-args -p name:=value"
+            )
+        rclpy.init(args=given)
+    except (RuntimeError, ValueError) as error:
+        print(f"cannot start: {error}", file=sys.stderr)
+        return False
+    return True
+
+
+def _create(node_class: Callable[[], ManagedNode]) -> ManagedNode | None:
+    try:
+        return node_class()
+    except (ConfigurationError, ParameterException) as error:
+        rclpy.logging.get_logger("vpsto_ros").fatal(str(error))
+        return None
+
+
+def _spin(node: ManagedNode) -> int:
+    executor = MultiThreadedExecutor(node.threads) if node.threads > 1 else SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        if node.get_parameter("autostart").value:
+            node.start()
+        executor.spin()
+    except ConfigurationError:
+        return 2  # logged by the transition that failed
+    finally:
+        executor.shutdown(timeout_sec=2.0)
+    return 0
