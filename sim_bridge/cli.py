@@ -129,6 +129,8 @@ def _load(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
+        if (error.name or "").startswith(("sim_bridge", "vpsto_ros")):
+            raise
         remedy = "make install, or pip install 'vpsto_ros[ros,sim]'"
         raise VpstoError(f"the Python package {error.name!r} is missing; install it: {remedy}") from error
 

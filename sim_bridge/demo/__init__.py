@@ -1,0 +1,1 @@
+"""Demos: the nodes as separate processes, a scenario that keeps them busy, and a verdict."""

@@ -1,0 +1,80 @@
+"""Child processes: start them with their own log files, notice when one ends, stop them all."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+
+class ProcessGroup:
+    """Processes that live and end together.
+
+    Use it as a context manager: leaving the block stops whatever still runs.
+    """
+
+    def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
+        """Prepare.
+
+        Args:
+            log_folder: gets one file per process with all that it prints; created when missing.
+            environment: added to the environment of every process.
+        """
+        self.log_folder = log_folder
+        self.environment = dict(environment)
+        self.exit_codes: dict[str, int] = {}
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        log_folder.mkdir(parents=True, exist_ok=True)
+
+    def start(self, name: str, command: Sequence[str]) -> None:
+        """Start a process under a name."""
+        with open(self.log_path(name), "wb") as log:
+            # In a session of its own: Ctrl-C in the terminal reaches only the parent, which then stops them in order.
+            self._processes[name] = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **self.environment},
+                start_new_session=True,
+            )
+
+    def log_path(self, name: str) -> Path:
+        """Where the output of a process goes."""
+        return self.log_folder / f"{name}.log"
+
+    def ended(self) -> list[str]:
+        """Names of the processes that are no longer running."""
+        return [name for name, process in self._processes.items() if process.poll() is not None]
+
+    def last_lines(self, name: str, count: int = 5) -> str:
+        """The end of a process's output."""
+        return "\n".join(self.log_path(name).read_text(errors="replace").strip().splitlines()[-count:])
+
+    def stop(self, patience: float = 5.0) -> dict[str, int]:
+        """Stop all processes: first SIGINT as Ctrl-C would, then SIGTERM, then SIGKILL.
+
+        Args:
+            patience: how long to wait after each signal [s].
+
+        Returns:
+            Exit codes by name; negative where a signal ended the process.
+        """
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            running = [process for process in self._processes.values() if process.poll() is None]
+            for process in running:
+                process.send_signal(number)
+            deadline = time.monotonic() + patience
+            while any(process.poll() is None for process in running) and time.monotonic() < deadline:
+                time.sleep(0.02)
+        self.exit_codes = {name: process.wait() for name, process in self._processes.items()}
+        return self.exit_codes
+
+    def __enter__(self) -> ProcessGroup:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()

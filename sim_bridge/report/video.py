@@ -1,0 +1,87 @@
+"""A video of a run, drawn by MuJoCo without a display, in a process of its own."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import multiprocessing
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sim_bridge.report.view import Frame, ModelState
+
+WIDTH, HEIGHT = 960, 540
+REMEDY = "apt install libegl1 libgl1 (or libosmesa6, and set MUJOCO_GL=osmesa)"
+
+
+def write_video(
+    path: Path, scene: Any, joint_names: Sequence[str], frames: Sequence[Frame], rate: float, camera: str = "overview"
+) -> str:
+    """Render frames into an mp4 file.
+
+    OpenGL is chosen when MuJoCo is imported and may end a process that has no driver for it, hence a process of its own.
+
+    Args:
+        path: file to write.
+        scene: what :func:`sim_bridge.scene.build` makes the model from.
+        joint_names: the robot's joints.
+        frames: what is seen.
+        rate: frames per second.
+        camera: name of the model's camera.
+
+    Returns:
+        An empty string, or why there is no video and how to get one.
+    """
+    before = os.environ.get("MUJOCO_GL")
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    context = multiprocessing.get_context("spawn")
+    try:
+        with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+            pool.submit(_render, path, scene, tuple(joint_names), list(frames), rate, camera).result()
+    except Exception as error:  # whatever a missing driver raises: AttributeError, ImportError, FatalError, a dead process
+        path.unlink(missing_ok=True)
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        return f"no video: OpenGL is not available ({reason}); to get it: {REMEDY}"
+    finally:
+        if before is None:
+            del os.environ["MUJOCO_GL"]
+    return ""
+
+
+def _render(path: Path, scene: Any, joint_names: Sequence[str], frames: list[Frame], rate: float, camera: str) -> None:
+    import imageio
+    import mujoco
+
+    from sim_bridge.scene import build
+
+    model = build(scene)
+    state = ModelState(model, joint_names)
+    options = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer, imageio.get_writer(path, fps=rate, **options) as writer:
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        for frame in frames:
+            state.pose(frame)
+            # Cameras and lights are not part of mj_kinematics.
+            mujoco.mj_camlight(model, state.data)
+            renderer.update_scene(state.data, camera)
+            _draw_plan(renderer.scene, frame)
+            writer.append_data(renderer.render())
+
+
+def _draw_plan(scene: Any, frame: Frame) -> None:
+    """The planned tool path as a line of thin capsules just above the table."""
+    import mujoco
+    import numpy as np
+
+    if frame.plan is None:
+        return
+    points = np.column_stack((frame.plan, np.full(len(frame.plan), 0.012)))[:: max(1, len(frame.plan) // 24)]
+    for begin, end in zip(points[:-1], points[1:], strict=True):
+        if scene.ngeom >= scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        rgba = np.array([0.06, 0.43, 0.52, 1.0], dtype=np.float32)
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.003, begin, end)
+        scene.ngeom += 1

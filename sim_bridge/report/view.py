@@ -1,0 +1,218 @@
+"""The robot cell in three dimensions in a browser: live from a server, or as a replay inside an HTML file."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+PLAN_POINTS = 24
+PLAN_HEIGHT = 0.012
+PLAN_COLOR = (15, 110, 132)
+# Geometry groups that are drawn; the higher ones hold what only collides.
+VISIBLE_GROUPS = range(3)
+BACKGROUND = "/background"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is seen at one instant.
+
+    Attributes:
+        joints: joint positions (n,) [rad].
+        object_pose: x, y [m] and yaw [rad] of the object, (3,); None leaves it where it is.
+        target: x, y [m] of the target (2,), hidden when None or not finite.
+        plan: points of the planned tool path (P, 2) [m], hidden when None.
+    """
+
+    joints: FloatArray
+    object_pose: FloatArray | None = None
+    target: FloatArray | None = None
+    plan: FloatArray | None = None
+
+
+class ModelState:
+    """A MuJoCo model of the cell, posed for drawing; used by the browser's views and by the video alike."""
+
+    def __init__(self, model: mujoco.MjModel, joint_names: Sequence[str]) -> None:
+        """Look up the robot's joints, the object and the goal marker by their names."""
+        self.model, self.data = model, mujoco.MjData(model)
+        self._joints = [model.joint(name).qposadr[0] for name in joint_names]
+        self._object = model.joint("object").qposadr[0]
+        self._goal = model.body("goal").mocapid[0]
+
+    def pose(self, frame: Frame) -> None:
+        """Put everything where it is in a frame and update the poses of all bodies."""
+        qpos = self.data.qpos
+        qpos[self._joints] = frame.joints
+        start = self._object
+        if frame.object_pose is not None:
+            x, y, yaw = frame.object_pose
+            qpos[start : start + 7] = (x, y, 0.0, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+        known = frame.target is not None and bool(np.all(np.isfinite(frame.target[:2])))
+        # A target without orientation is drawn turned like the object; without a target it hides under the table.
+        self.data.mocap_pos[self._goal] = (*frame.target[:2], 0.0005) if known else (0.5, 0.0, -0.5)
+        self.data.mocap_quat[self._goal] = qpos[start + 3 : start + 7]
+        mujoco.mj_kinematics(self.model, self.data)
+
+
+class CellView:
+    """Draws the cell with viser and moves it."""
+
+    def __init__(self, server: Any, model: mujoco.MjModel, joint_names: Sequence[str]) -> None:
+        """Build the scene.
+
+        Args:
+            server: a running ``viser.ViserServer``.
+            model: robot, table, object and goal marker.
+            joint_names: the robot's joints, in the order of a frame's positions.
+        """
+        self._server = server
+        self._state = ModelState(model, joint_names)
+        scene = server.scene
+        scene.set_up_direction("+z")
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(enabled=True, cast_shadow=False)
+        scene.add_light_ambient("/light", intensity=0.9)
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.up = (1.42, -0.92, 0.92), (0.36, 0.0, 0.17), (0.0, 0.0, 1.0)
+        camera.fov = math.radians(42.0)
+        mujoco.mj_kinematics(model, self._state.data)
+        self._bodies = {body: self._add_body(body) for body in range(model.nbody)}
+        self._plan = scene.add_line_segments(
+            "/plan", np.zeros((PLAN_POINTS - 1, 2, 3)), PLAN_COLOR, thickness=0.006, visible=False
+        )
+        self._drawn_plan: FloatArray | None = None
+
+    def _add_body(self, body: int) -> Any:
+        """A frame with one mesh per colour below it."""
+        model, data = self._state.model, self._state.data
+        path = f"/{model.body(body).name}" if body else BACKGROUND
+        frame = self._server.scene.add_frame(
+            path, show_axes=False, position=data.xpos[body], wxyz=data.xquat[body]
+        )
+        for number, ((red, green, blue, alpha), mesh) in enumerate(_meshes(model, body).items()):
+            self._server.scene.add_mesh_simple(
+                f"{path}/{number}", mesh.vertices, mesh.faces, color=(red, green, blue),
+                opacity=None if alpha == 255 else alpha / 255,
+            )  # fmt: skip
+        return frame
+
+    def show(self, frame: Frame) -> None:
+        """Move everything to where it is in a frame."""
+        self._state.pose(frame)
+        data = self._state.data
+        with self._server.atomic():
+            for body, handle in self._bodies.items():
+                _move(handle, data.xpos[body], data.xquat[body])
+            self._show_plan(frame.plan)
+
+    def _show_plan(self, plan: FloatArray | None) -> None:
+        if plan is self._drawn_plan:
+            return
+        self._drawn_plan = plan
+        if plan is not None and len(plan) > 1:
+            index = np.linspace(0, len(plan) - 1, PLAN_POINTS)
+            columns = [np.interp(index, np.arange(len(plan)), plan[:, axis]) for axis in (0, 1)]
+            points = np.stack((*columns, np.full(PLAN_POINTS, PLAN_HEIGHT)), axis=-1)
+            self._plan.points = np.stack((points[:-1], points[1:]), axis=1)
+        visible = plan is not None and len(plan) > 1
+        if self._plan.visible != visible:
+            self._plan.visible = visible
+
+
+def open_server(port: int = 0) -> Any:
+    """A viser server on 127.0.0.1 without its greeting.
+
+    Args:
+        port: where it listens; 0 chooses a free port.
+    """
+    import viser
+
+    # It prints a banner whatever `verbose` says.
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+
+
+def replay_page(model: mujoco.MjModel, joint_names: Sequence[str], frames: Iterable[Frame], rate: float) -> str:
+    """A self-contained HTML page that plays a run and lets one look at it from all sides.
+
+    Args:
+        model: robot, table, object and goal marker.
+        joint_names: the robot's joints.
+        frames: at least one.
+        rate: frames per second.
+    """
+    server = open_server()
+    try:
+        view = CellView(server, model, joint_names)
+        iterator = iter(frames)
+        view.show(next(iterator))
+        serializer = server.get_scene_serializer()
+        for frame in iterator:
+            serializer.insert_sleep(1.0 / rate)
+            view.show(frame)
+        return serializer.as_html()
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def _move(handle: Any, position: FloatArray, wxyz: FloatArray) -> None:
+    """Set a pose, but only where it changed: a replay stores every assignment."""
+    if not np.allclose(handle.position, position, atol=1e-5):
+        handle.position = position
+    if not np.allclose(handle.wxyz, wxyz, atol=1e-5):
+        handle.wxyz = wxyz
+
+
+def _meshes(model: mujoco.MjModel, body: int) -> dict[tuple[int, int, int, int], Any]:
+    """The visible geometry of a body in the body's frame, joined by colour (red, green, blue, alpha from 0 to 255)."""
+    import trimesh
+
+    parts: dict[tuple[int, int, int, int], list[Any]] = {}
+    first, number = model.body_geomadr[body], model.body_geomnum[body]
+    for geom in range(first, first + number):
+        mesh = _primitive(model, geom) if model.geom_group[geom] in VISIBLE_GROUPS else None
+        if mesh is not None:
+            rotation = np.zeros(9)
+            mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+            transform = np.eye(4)
+            transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
+            mesh.apply_transform(transform)
+            # Vertices are split along sharp edges, else the ends of a cylinder look rounded.
+            parts.setdefault(_color(model, geom), []).append(trimesh.graph.smooth_shade(mesh, angle=0.6))
+    return {color: trimesh.util.concatenate(meshes) for color, meshes in parts.items()}
+
+
+def _primitive(model: mujoco.MjModel, geom: int) -> Any:
+    from trimesh import creation
+
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return creation.box(extents=2.0 * size)
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return creation.cylinder(radius=size[0], height=2.0 * size[1], sections=40)
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        mesh = creation.capsule(height=2.0 * size[1], radius=size[0], count=(16, 32))
+        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))
+        return mesh
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return creation.icosphere(subdivisions=3, radius=size[0])
+    return None
+
+
+def _color(model: mujoco.MjModel, geom: int) -> tuple[int, int, int, int]:
+    material = model.geom_matid[geom]
+    rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+    red, green, blue, alpha = (round(255 * float(value)) for value in rgba)
+    return red, green, blue, alpha
