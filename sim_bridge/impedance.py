@@ -1,0 +1,137 @@
+"""Joint impedance control, eq. (2.5), as it runs on the arm at 1 kHz."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from vpsto_ros.configuration import option, validate
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.robot.kinematics import Robot
+
+
+@dataclass(frozen=True)
+class ImpedanceConfig:
+    """Gains of the impedance controller.
+
+    The stiffness lies between what FR3 controllers use in compliant tasks and the arm's own joint impedance; a push of 6 N at the
+    tip then costs at most 3 mm on the table. Joint 7 turns a round rod about its axis and has next to no inertia: soft, so that its
+    natural frequency stays far below the control rate.
+    """
+
+    stiffness: tuple[float, ...] = option(
+        (2000.0, 2000.0, 2000.0, 2000.0, 1000.0, 800.0, 25.0),
+        "joint stiffness", unit="Nm/rad", minimum=0.0, maximum=5000.0,
+    )  # fmt: skip
+    damping_ratio: float = option(1.0, "damping relative to critical", minimum=0.0, maximum=1.5)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        validate(self)
+
+
+class ImpedanceController:
+    """u = C(q, qd) qd + g(q) + M(q) qdd_des - K (q - q_des) - D (qd - qd_des), within torque and torque-rate limits.
+
+    Eq. (2.5). One recursive Newton-Euler pass gives the first three terms. The damping matrix is designed once, at a nominal posture,
+    such that every mode of M and K has the wanted damping ratio there (double diagonalization).
+
+    Attributes:
+        saturated: control cycles in which each joint's torque was cut to its limit, shape (7,).
+        rate_limited: likewise for the torque rate, shape (7,).
+        demand: what the last cycle asked for before it was cut, as shares of the torque and torque-rate limits, shape (2, 7).
+    """
+
+    def __init__(
+        self, robot: Robot, nominal_posture: ArrayLike, config: ImpedanceConfig | None = None, *, period: float = 0.001
+    ):
+        """Design the gains.
+
+        Args:
+            robot: model of the arm.
+            nominal_posture: joint positions at which the damping is designed [rad], shape (7,).
+            config: gains.
+            period: control period [s].
+
+        Raises:
+            InvalidInputError: the period is not positive.
+        """
+        if not period > 0.0:
+            raise InvalidInputError(f"period must be positive, got {period}")
+        config = config or ImpedanceConfig()
+        self._robot = robot
+        self._stiffness = np.array(config.stiffness)
+        self._damping = critical_damping(robot.mass_matrix(nominal_posture), self._stiffness, config.damping_ratio)
+        self._limit = np.array(robot.torque_limits)
+        self._step = np.array(robot.torque_rate_limits) * period
+        self._torque = np.zeros(7)
+        self._counts = np.zeros((2, 7), dtype=np.int64)
+        self.demand = np.zeros((2, 7))
+        self._fresh = True
+
+    @property
+    def saturated(self) -> NDArray[np.int64]:
+        """Control cycles cut to the torque limit, per joint."""
+        return self._counts[0].copy()
+
+    @property
+    def rate_limited(self) -> NDArray[np.int64]:
+        """Control cycles cut to the torque-rate limit, per joint."""
+        return self._counts[1].copy()
+
+    def reset(self) -> None:
+        """Forget the last torque, so that the next one is not rate limited; counts are kept."""
+        self._fresh = True
+
+    def torque(
+        self, q: NDArray, qd: NDArray, q_des: NDArray, qd_des: NDArray, qdd_des: NDArray
+    ) -> NDArray[np.float64]:
+        """Torques [Nm] for this cycle, shape (7,); the array is reused by the next call.
+
+        Args:
+            q: measured joint positions [rad], shape (7,).
+            qd: measured joint velocities [rad/s], shape (7,).
+            q_des: desired positions [rad], shape (7,).
+            qd_des: desired velocities [rad/s], shape (7,).
+            qdd_des: desired accelerations [rad/s²], shape (7,).
+        """
+        model_torque = self._robot.inverse_dynamics(q, qd, qdd_des)
+        _control_law(
+            model_torque, q, qd, q_des, qd_des, self._stiffness, self._damping, self._limit, self._step, self._fresh,
+            self._torque, self._counts, self.demand,
+        )  # fmt: skip
+        self._fresh = False
+        return self._torque
+
+
+def critical_damping(mass_matrix: NDArray, stiffness: NDArray, ratio: float = 1.0) -> NDArray[np.float64]:
+    """Damping matrix (n, n) with which M x'' + D x' + K x = 0 falls apart into modes of equal damping ratio.
+
+    With M = Q'Q and K = Q' diag(w²) Q it is D = 2 ratio Q' diag(w) Q.
+    """
+    squares, modes = scipy.linalg.eigh(np.diag(stiffness), mass_matrix)
+    back = mass_matrix @ modes
+    return np.ascontiguousarray((back * (2.0 * ratio * np.sqrt(np.maximum(squares, 0.0)))) @ back.T)
+
+
+@njit(cache=True, nogil=True)
+def _control_law(
+    model_torque, q, qd, q_des, qd_des, stiffness, damping, limit, step, fresh, torque, counts, demand
+):
+    """Add stiffness and damping to the model's torque; cut to limits; write the torque in place."""
+    for i in range(7):
+        u = model_torque[i] - stiffness[i] * (q[i] - q_des[i])
+        for j in range(7):
+            u -= damping[i, j] * (qd[j] - qd_des[j])
+        demand[0, i] = abs(u) / limit[i]
+        if demand[0, i] > 1.0:
+            counts[0, i] += 1
+            u = limit[i] if u > 0.0 else -limit[i]
+        change = u - torque[i]
+        demand[1, i] = 0.0 if fresh else abs(change) / step[i]
+        if demand[1, i] > 1.0:
+            counts[1, i] += 1
+            u = torque[i] + (step[i] if change > 0.0 else -step[i])
+        torque[i] = u
