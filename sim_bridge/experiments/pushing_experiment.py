@@ -1,0 +1,133 @@
+"""An experiment on pushing: variants of the planner on the same random trials, a table, figures and summary.json."""
+
+import argparse
+import dataclasses
+import os
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sim_bridge.experiments.pushing_loop import PushingLoop
+from sim_bridge.experiments.pushing_trials import Trial, TrialResult, run_trial, simulate, start_joints
+from sim_bridge.experiments.runs import markdown_table, quantile, run_trials, success_interval, write_summary
+from vpsto_ros.contact.geometry import PlanarShape
+from vpsto_ros.contact.pushing import PushingModel
+from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.planning.contact import ContactPlannerConfig, PushContactPlanner
+from vpsto_ros.planning.pushing import PushingMpc, PushingMpcConfig
+from vpsto_ros.robot.kinematics import fr3_pusher
+
+TOOL_RADIUS = 0.015
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A planner to try: a name, what it is, its options and its class."""
+
+    name: str
+    title: str
+    config: PushingMpcConfig
+    planner: type[PushingMpc] = PushingMpc
+
+
+def run_variant(task: tuple[Variant, Trial]) -> TrialResult:
+    """One closed-loop run of one variant."""
+    variant, trial = task
+    model = PushingModel(trial.plant.shape, PlanarShape.disc(TOOL_RADIUS))
+    planner = variant.planner(variant.config, model, fr3_pusher(), np.random.default_rng([trial.seed, 2]))
+    planner.warm_up()
+    simulation = simulate(trial, start_joints(planner.table_map, trial.start, trial.plant.shape))
+    contact_planner = PushContactPlanner(ContactPlannerConfig(), model)
+    loop = PushingLoop(simulation, planner, contact_planner, lambda now: trial.planar_goal)
+    return run_trial(trial, loop, variant.config.workspace)
+
+
+@dataclasses.dataclass(frozen=True)
+class PushingExperiment:
+    """What is run, on which trials."""
+
+    name: str
+    title: str
+    random_trial: Callable[[int], Trial]
+    variants: tuple[Variant, ...]
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Options of this experiment."""
+        names = [variant.name for variant in self.variants]
+        parser.add_argument("--jobs", type=int, default=os.cpu_count(), metavar="N", help="parallel processes (default: all cores)")
+        parser.add_argument(
+            "--only", action="append", metavar="VARIANT", help=f"run only this variant, may be repeated; one of: {', '.join(names)}"
+        )
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Run all variants on the same trials and write the results; 0 when nothing unsafe happened and most runs succeeded."""
+        folder = pathlib.Path(arguments.out)
+        trials = [self.random_trial(seed) for seed in range(arguments.seed, arguments.seed + arguments.runs)]
+        results = {}
+        for variant in self._chosen(arguments.only):
+            tasks = [(variant, trial) for trial in trials]
+            results[variant.name] = run_trials(run_variant, tasks, arguments.jobs, variant.title)
+        return self._report(folder, trials, results)
+
+    def _chosen(self, names: Sequence[str] | None) -> list[Variant]:
+        known = {variant.name: variant for variant in self.variants}
+        for name in names or ():
+            if name not in known:
+                raise ConfigurationError(f"--only {name}: no such variant; there are {', '.join(known)}")
+        return [variant for variant in self.variants if not names or variant.name in names]
+
+    def _report(self, folder: pathlib.Path, trials: list[Trial], results: dict[str, list[TrialResult]]) -> int:
+        from sim_bridge.experiments import pushing_figures
+
+        summaries = {name: summarise(runs) for name, runs in results.items()}
+        first, *others = summaries
+        summary: dict[str, Any] = {"experiment": self.name, "seed": trials[0].seed, **summaries[first]}
+        summary["baselines"] = {name: summaries[name] for name in others}
+        write_summary(folder, summary)
+        titles = {variant.name: variant.title for variant in self.variants}
+        table = results_table(titles, summaries)
+        (folder / "table.md").write_text(f"# {self.title}\n\n{table}")
+        pushing_figures.write(folder, titles, trials, results)
+        print(f"{self.title}\n\n{table}\nresults in {folder}")
+        good = summaries[first]["limit_violations"] == 0 and summaries[first]["success_rate"] >= 0.9
+        print("verdict: " + ("passed" if good else "FAILED") + f" for '{titles[first]}'")
+        return 0 if good else 1
+
+
+def summarise(runs: list[TrialResult]) -> dict[str, Any]:
+    """The figures of one variant."""
+    successes = sum(run.success for run in runs)
+    times = [run.time_to_goal for run in runs]
+    compute = 1e3 * np.concatenate([run.compute for run in runs])
+    return {
+        "runs": len(runs),
+        "success_rate": successes / len(runs),
+        "success_ci95": success_interval(successes, len(runs)),
+        "limit_violations": sum(run.limit_violations for run in runs),
+        "left_workspace": sum(run.left_workspace for run in runs),
+        "time_to_goal_s_median": quantile(times, 0.5),
+        "time_to_goal_s_p90": quantile(times, 0.9),
+        "time_to_goal_before_knock_s_median": quantile((run.time_to_goal_before_knock for run in runs), 0.5),
+        "final_error_m_median": quantile((run.final_error for run in runs), 0.5),
+        "tool_height_error_m_max": max(run.tool_height_error for run in runs),
+        "rejected_trajectories": sum(run.rejected for run in runs),
+        "compute_ms": {"p50": quantile(compute, 0.5), "p99": quantile(compute, 0.99), "max": float(compute.max())},
+        "failed_seeds": [run.seed for run in runs if not run.success],
+    }
+
+
+def results_table(titles: dict[str, str], summaries: dict[str, dict[str, Any]]) -> str:
+    """The table that goes into the README."""
+    header = ["planner", "success", "95 % CI", "time to goal, median / p90", "left workspace", "limits broken", "replan p99"]
+    rows = []
+    for name, s in summaries.items():
+        low, high = s["success_ci95"]
+        times = [s["time_to_goal_s_median"], s["time_to_goal_s_p90"]]
+        rows.append([
+            titles[name], f"{round(s['success_rate'] * s['runs'])} of {s['runs']}", f"{low:.3f}-{high:.3f}",
+            " / ".join("-" if t is None else f"{t:.1f}" for t in times) + " s",
+            f"{s['left_workspace']}", f"{s['limit_violations']}", f"{s['compute_ms']['p99']:.1f} ms",
+        ])  # fmt: skip
+    return markdown_table(header, rows)
