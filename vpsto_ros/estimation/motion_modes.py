@@ -1,16 +1,21 @@
-"""Interacting Kalman filters for an object that rests, glides or is being accelerated (cf. the modes of 5.2.3).
+"""Interacting Kalman filters for an object that rests, moves evenly or is being accelerated (cf. 5.2.3).
 
-The state is x, y, yaw and their time derivatives. All modes measure the pose; they differ in how the state goes on. Each
-keeps a Gaussian; before every step the Gaussians are mixed according to how likely a change of mode is (interacting
-multiple models, Blom and Bar-Shalom 1988). Yaw is continuous here, not wrapped, except in differences.
+The state is x, y, yaw and their time derivatives. All modes measure the pose; they differ in how the state
+goes on. Each keeps a Gaussian; before every step the Gaussians are mixed according to how likely a change of
+mode is (interacting multiple models, Blom and Bar-Shalom 1988). Yaw is continuous here, not wrapped, except
+in differences.
 """
 
 import dataclasses
+import functools
 import math
+from typing import Any
 
 import numpy as np
 
 _LOWEST_PROBABILITY = 1e-6
+_IDENTITY = np.eye(6)
+_MEASURES_POSE = np.eye(3, 6)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +25,8 @@ class MotionModes:
     Attributes:
         keeps_velocity: 1 for constant velocity, 0 for an object at rest, shape (M,).
         position_noise: random walk of the pose in x, y [m/sqrt(s)] and yaw [rad/sqrt(s)], shape (M, 3).
-        velocity_noise: random walk of the twist, shape (M, 3); as long as the mode keeps its velocity, per sqrt(s).
+        velocity_noise: random walk of the twist, shape (M, 3); as long as the mode keeps its velocity, per
+            sqrt(s).
         dwell: mean time spent in a mode [s], shape (M,).
     """
 
@@ -35,27 +41,37 @@ class MotionModes:
         White-noise acceleration with density q: the covariance of position and velocity is
         q [[dt^3/3, dt^2/2], [dt^2/2, dt]], positive definite, unlike (5.7) with its position noise of zero.
         """
+        still, moving, noises = self._powers
+        weights = np.array([1.0, gap, gap**2, gap**3])
+        return still + gap * moving, (weights @ noises).reshape(still.shape)
+
+    @functools.cached_property
+    def _powers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Transition still + dt moving, and process noise as a cubic in dt with coefficients (4, M * 36)."""
         count = len(self.dwell)
-        matrix = np.zeros((count, 6, 6))
-        noise = np.zeros((count, 6, 6))
         axes = np.arange(3)
         keeps = self.keeps_velocity[:, None]
-        matrix[:, axes, axes] = 1.0
-        matrix[:, axes, axes + 3] = keeps * gap
-        matrix[:, axes + 3, axes + 3] = keeps
-        density = self.velocity_noise**2
-        noise[:, axes, axes] = self.position_noise**2 * gap + keeps * density * (gap**3 / 3)
-        noise[:, axes, axes + 3] = noise[:, axes + 3, axes] = keeps * density * (gap**2 / 2)
-        noise[:, axes + 3, axes + 3] = np.where(keeps > 0, density * gap, density)
-        return matrix, noise
+        still, moving = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
+        still[:, axes, axes] = 1.0
+        still[:, axes + 3, axes + 3] = keeps
+        moving[:, axes, axes + 3] = keeps
+        density = keeps * self.velocity_noise**2
+        noise = np.zeros((4, count, 6, 6))
+        noise[0][:, axes + 3, axes + 3] = (1.0 - keeps) * self.velocity_noise**2
+        noise[1][:, axes, axes] = self.position_noise**2
+        noise[1][:, axes + 3, axes + 3] = density
+        noise[2][:, axes, axes + 3] = noise[2][:, axes + 3, axes] = density / 2
+        noise[3][:, axes, axes] = density / 3
+        return still, moving, noise.reshape(4, -1)
 
     def switching(self, gap: float) -> np.ndarray:
         """Probability of going from mode i to mode j within `gap` seconds, shape (M, M), rows sum to one."""
         count = len(self.dwell)
         leave = 1.0 - np.exp(-gap / self.dwell)
-        chances = np.repeat(leave[:, None] / max(count - 1, 1), count, axis=1)
-        np.fill_diagonal(chances, 1.0 - leave if count > 1 else 1.0)
-        return chances
+        if count == 1:
+            return np.ones((1, 1))
+        elsewhere = leave[:, None] / (count - 1)
+        return elsewhere + np.diag(1.0 - leave - elsewhere[:, 0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,8 +124,7 @@ class ModeBelief:
         """Bayes' rule for every mode and for their probabilities; Joseph form."""
         gain = self.covariance[:, :, :3] @ innovation.inverse
         mean = self.mean + (gain @ innovation.difference[:, :, None])[:, :, 0]
-        rest = np.tile(np.eye(6), (len(mean), 1, 1))
-        rest[:, :, :3] -= gain
+        rest = _IDENTITY - gain @ _MEASURES_POSE
         posterior = _symmetric(rest @ self.covariance @ _t(rest) + gain @ covariance @ _t(gain))
         log = -0.5 * (innovation.distance + np.log(np.linalg.det(innovation.expected)))
         probability = self.probability * np.exp(log - log.max())
@@ -149,12 +164,14 @@ class Innovation:
         return float(mean @ np.linalg.solve(covariance, mean))
 
 
-def wrapped(angle: np.ndarray | float) -> np.ndarray | float:
-    """Angle [rad] brought into [-pi, pi)."""
+def wrapped(angle: Any) -> Any:
+    """Angles [rad], a number or an array, brought into [-pi, pi)."""
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def _moments(weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moments(
+    weights: np.ndarray, means: np.ndarray, covariances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     mean = weights @ means
     off = means - mean
     covariance = (weights[:, None, None] * covariances).sum(axis=0) + (off.T * weights) @ off

@@ -1,8 +1,9 @@
 """The filter between the camera and the pushing planner: pose and twist of an object on the table.
 
-A box on a table rests, is pushed at an even speed, or is being accelerated: by the tool, or by a hand that knocks it away.
-One process noise cannot serve all three, so the filter runs one Kalman filter for each, in x, y and yaw, and lets them
-interact (:mod:`vpsto_ros.estimation.motion_modes`). The moving modes have constant velocity with white-noise acceleration.
+A box on a table rests, is pushed at an even speed, or is being accelerated: by the tool, or by a hand that
+knocks it away. One process noise cannot serve all three, so the filter runs one Kalman filter for each, in x,
+y and yaw, and lets them interact (:mod:`vpsto_ros.estimation.motion_modes`). The moving modes have constant
+velocity with white-noise acceleration.
 """
 
 import dataclasses
@@ -13,7 +14,7 @@ import numpy as np
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes, wrapped
 from vpsto_ros.estimation.object_state import ObjectState
-from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 _FARTHEST = 1e3  # no pose of a table-top object has a coordinate beyond this [m, rad]
 
@@ -27,7 +28,10 @@ class PlanarKalmanConfig:
     """
 
     rest_drift: tuple[float, float] = option(
-        (5e-4, 2e-3), "random walk of a resting object, linear and angular", unit="m, rad per sqrt(s)", minimum=1e-6
+        (5e-4, 2e-3),
+        "random walk of a resting object, linear and angular",
+        unit="m, rad per sqrt(s)",
+        minimum=1e-6,
     )
     steady_noise: tuple[float, float] = option(
         (0.1, 1.0), "change of velocity while pushed evenly", unit="m/s, rad/s per sqrt(s)", minimum=1e-6
@@ -42,17 +46,30 @@ class PlanarKalmanConfig:
         30.0, "squared Mahalanobis distance beyond which a pose is an outlier", minimum=1.0, maximum=1e6
     )
     confirmations: int = option(
-        3, "consecutive outliers that agree with each other and move the filter to them", minimum=1, maximum=100
+        3,
+        "consecutive outliers that agree with each other and move the filter to them",
+        minimum=1,
+        maximum=100,
     )
-    max_speed: float = option(1.0, "speed up to which outliers agree", unit="m/s", minimum=1e-3, maximum=100.0)
+    max_speed: float = option(
+        1.0, "speed up to which outliers agree", unit="m/s", minimum=1e-3, maximum=100.0
+    )
     max_yaw_rate: float = option(
         12.0, "yaw rate up to which outliers agree", unit="rad/s", minimum=1e-3, maximum=1000.0
     )
     max_gap: float = option(
-        0.4, "longest time without a pose after which the past still counts", unit="s", minimum=0.01, maximum=60.0
+        0.4,
+        "longest time without a pose after which the past counts; a stamp so much older is refused",
+        unit="s",
+        minimum=0.01,
+        maximum=60.0,
     )
     max_jump: float = option(
-        60.0, "a stamp farther than this from the last one is refused at first", unit="s", minimum=0.1, maximum=1e6
+        2.0,
+        "a stamp that is so much later than the last one is refused until others agree",
+        unit="s",
+        minimum=0.01,
+        maximum=1e6,
     )
     max_extrapolation: float = option(
         0.2, "longest time for which a prediction goes on moving", unit="s", minimum=0.0, maximum=60.0
@@ -60,6 +77,10 @@ class PlanarKalmanConfig:
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.max_jump < self.max_gap:
+            raise ConfigurationError(
+                f"max_jump = {self.max_jump} must not be smaller than max_gap = {self.max_gap}"
+            )
 
 
 class Outcome(str):
@@ -88,8 +109,9 @@ class _Measurement:
 class PlanarKalman:
     """Estimates an object's planar pose and twist from stamped poses.
 
-    Feed every pose to :meth:`update`, in the order of arrival; ask :meth:`predict` for the state at any later time. The filter never
-    raises on what a camera delivers: the outcome says what was wrong, and the estimate is left as it was.
+    Feed every pose to :meth:`update`, in the order of arrival; ask :meth:`predict` for the state at any later
+    time. The filter never raises on what a camera delivers: the outcome says what was wrong, and the estimate
+    is left as it was.
     """
 
     def __init__(self, config: PlanarKalmanConfig | None = None) -> None:
@@ -117,8 +139,8 @@ class PlanarKalman:
     def predict(self, stamp: float) -> ObjectState | None:
         """State at `stamp` [s], None before the first pose.
 
-        A stamp before the last accepted pose gives the state at that pose. Beyond ``max_extrapolation`` the object is taken
-        to stand where it would be then, with a covariance that goes on growing.
+        A stamp before the last accepted pose gives the state at that pose. Beyond ``max_extrapolation`` the
+        object is taken to stand where it would be then, with a covariance that goes on growing.
 
         Raises:
             InvalidInputError: the stamp is not finite.
@@ -127,9 +149,11 @@ class PlanarKalman:
             raise InvalidInputError(f"cannot predict to stamp {stamp!r}")
         if self._belief is None or stamp <= self._stamp:
             return self.state
-        gap = stamp - self._stamp
-        belief = self._belief.propagated(self._modes, min(gap, self.config.max_extrapolation), gap)
-        return _object_state(stamp, belief.unwound())
+        gap, longest = stamp - self._stamp, self.config.max_extrapolation
+        belief = self._belief.propagated(self._modes, min(gap, longest), gap).unwound()
+        if gap > longest:
+            belief.mean[:, 3:] = 0.0
+        return _object_state(stamp, belief)
 
     def update(self, stamp: float, pose: np.ndarray, covariance: np.ndarray) -> Outcome:
         """Take in a measured pose.
@@ -140,9 +164,10 @@ class PlanarKalman:
             covariance: of the pose, shape (3, 3).
 
         Returns:
-            "accepted"; "outlier" (too unlikely; ignored unless the following ones agree with it); "reinitialized" (the
-            estimate now starts from this and the preceding outliers, or from this pose after a long gap); "stale" (not
-            newer than what is known) or "invalid: reason". The attribute ``reason`` explains.
+            "accepted"; "outlier" (too unlikely; ignored unless the following ones agree with it);
+            "reinitialized" (the estimate now starts from this and the preceding outliers, or from this pose
+            after a long gap); "stale" (not newer than what is known) or "invalid: reason". The attribute
+            ``reason`` explains.
         """
         defect, measurement = _checked(stamp, pose, covariance)
         if measurement is None:
@@ -151,17 +176,17 @@ class PlanarKalman:
             self._restart([measurement])
             return Outcome("accepted", "first pose")
         gap = measurement.stamp - self._stamp
-        if abs(gap) > self.config.max_jump:
+        if not -self.config.max_gap <= gap <= self.config.max_jump:
             return self._pend(measurement, "invalid", f"stamp jumps by {gap:.3g} s")
         if gap <= 0:
             return Outcome("stale", f"stamp is {-gap:.4g} s older than the last accepted one")
         if gap > self.config.max_gap:
             self._restart([measurement])
             return Outcome("reinitialized", f"first pose after {gap:.3g} s")
-        return self._correct(measurement, gap)
+        return self._correct(self._belief, measurement, gap)
 
-    def _correct(self, measurement: _Measurement, gap: float) -> Outcome:
-        predicted = self._belief.mixed(self._modes, gap).propagated(self._modes, gap)
+    def _correct(self, belief: ModeBelief, measurement: _Measurement, gap: float) -> Outcome:
+        predicted = belief.mixed(self._modes, gap).propagated(self._modes, gap)
         innovation = predicted.innovation(measurement.pose, measurement.covariance)
         self.normalized_innovation = innovation.normalized(predicted.probability)
         distance = float(innovation.distance.min())
@@ -192,7 +217,7 @@ class PlanarKalman:
         noise = first.covariance + second.covariance
         reach = self.config.max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
         turn = self.config.max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
-        return math.hypot(step[0], step[1]) <= reach and abs(wrapped(step[2])) <= turn
+        return math.hypot(step[0], step[1]) <= reach and bool(abs(wrapped(step[2])) <= turn)
 
     def _restart(self, measurements: list[_Measurement]) -> None:
         """Begin at the first measurement and replay the others, so that the twist is known as well."""

@@ -1,9 +1,10 @@
 """Evolution strategies with covariance matrix adaptation, vectorised for small populations and short loops.
 
-:class:`CmaEs` is CMA-ES with positive recombination weights and the default parameters of Hansen, "The CMA Evolution
-Strategy: A Tutorial" (2016), and its separable variant with the learning rates of Ros and Hansen (2008). External
-solutions are accepted as in Hansen, "Injecting external solutions into CMA-ES" (2011). :class:`PycmaEs` is the same
-interface on the ``cma`` package, kept as a choice and as the reference in the tests.
+:class:`CmaEs` is CMA-ES with positive recombination weights and the default parameters of Hansen, "The CMA
+Evolution Strategy: A Tutorial" (2016), and its separable variant with the learning rates of Ros and Hansen
+(2008). External solutions are accepted as in Hansen, "Injecting external solutions into CMA-ES" (2011).
+:class:`PycmaEs` is the same interface on the ``cma`` package, kept as a choice and as the reference in the
+tests.
 """
 
 import dataclasses
@@ -25,14 +26,18 @@ class Strategy(Protocol):
     sigma: float
 
     @property
-    def mean(self) -> np.ndarray: ...
+    def mean(self) -> np.ndarray:
+        """Mean of the search distribution, shape (D,)."""
 
     @property
-    def covariance_diagonal(self) -> np.ndarray: ...
+    def covariance_diagonal(self) -> np.ndarray:
+        """Variances of the search distribution divided by sigma^2, shape (D,)."""
 
-    def ask(self) -> np.ndarray: ...
+    def ask(self) -> np.ndarray:
+        """Draw a population, shape (M, D)."""
 
-    def tell(self, samples: np.ndarray, costs: np.ndarray, injected: int = 0) -> None: ...
+    def tell(self, samples: np.ndarray, costs: np.ndarray, injected: int = 0) -> None:
+        """Learn from the costs (M,) of samples (M, D), of which the first `injected` came from elsewhere."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +84,8 @@ def default_parameters(dimension: int, population: int, separable: bool) -> Stra
 class CmaEs:
     """CMA-ES (full covariance) or sep-CMA-ES (diagonal covariance), minimising.
 
-    The samples of an iteration are x_i = m + sigma y_i with y_i ~ N(0, C). ``sigma`` may be changed between iterations.
+    The samples of an iteration are x_i = m + sigma y_i with y_i ~ N(0, C). ``sigma`` may be changed between
+    iterations.
 
     Args:
         dimension: number of variables D >= 1.
@@ -90,7 +96,8 @@ class CmaEs:
         separable: adapt the diagonal of C only.
 
     Raises:
-        InvalidInputError: a size or the step size is out of range, or the mean has the wrong shape or is not finite.
+        InvalidInputError: a size or the step size is out of range, or the mean has the wrong shape or is not
+            finite.
     """
 
     def __init__(
@@ -138,11 +145,13 @@ class CmaEs:
         """Update the distribution from the ranks of the costs.
 
         Args:
-            samples: what was evaluated, shape (M, D): the result of :meth:`ask`, in which the first rows may have been
-                replaced by solutions from elsewhere.
-            costs: shape (M,). Non-finite costs rank last and never contribute; if none is finite nothing is learned.
-            injected: number of leading rows that did not come from :meth:`ask`. Their steps are shortened to a length
-                the distribution could have drawn, so that a distant one cannot blow up the covariance.
+            samples: what was evaluated, shape (M, D): the result of :meth:`ask`, in which the first rows may
+                have been replaced by solutions from elsewhere.
+            costs: shape (M,). Non-finite costs rank last and never contribute; if none is finite nothing is
+                learned.
+            injected: number of leading rows that did not come from :meth:`ask`. Their steps are shortened to
+                a length the distribution could have drawn, so that a distant one cannot blow up the
+                covariance.
         """
         self.iterations += 1
         order, weights, mu_eff = self._select(costs)
@@ -190,7 +199,7 @@ class CmaEs:
         self._path_sigma = (1 - c) * self._path_sigma + math.sqrt(c * (2 - c) * mu_eff) * self._whiten(step)
         length = math.sqrt(float(self._path_sigma @ self._path_sigma))
         expected = math.sqrt(1 - (1 - c) ** (2 * self.iterations)) * p.chi
-        # A long path means the step size is far too small; adapting the shape then would only follow the drift.
+        # A long path means that the step size is far too small; the shape would only follow the drift.
         stalled = length >= (1.4 + 2 / (self._mean.size + 1)) * expected
         self._path_c = (1 - p.c_c) * self._path_c
         if not stalled:
@@ -246,7 +255,9 @@ class PycmaEs:
             "verbose": -9,
         }
         if dimension == 1:
-            raise InvalidInputError("the cma package needs at least 2 variables; use strategy 'cma' or 'sep-cma'")
+            raise InvalidInputError(
+                "the cma package needs at least 2 variables; use strategy 'cma' or 'sep-cma'"
+            )
         self._strategy = cma.CMAEvolutionStrategy(start, float(sigma), options)
         self.population = population
 
@@ -306,7 +317,9 @@ def make_strategy(
 
 def _checked_mean(dimension: int, population: int, sigma: float, mean: np.ndarray | None) -> np.ndarray:
     if dimension < 1 or population < 4:
-        raise InvalidInputError(f"expected dimension >= 1 and population >= 4, got {dimension} and {population}")
+        raise InvalidInputError(
+            f"expected dimension >= 1 and population >= 4, got {dimension} and {population}"
+        )
     if not (math.isfinite(sigma) and sigma > 0):
         raise InvalidInputError(f"the step size sigma must be finite and positive, got {sigma!r}")
     if mean is None:

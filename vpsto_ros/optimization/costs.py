@@ -1,7 +1,7 @@
 """Cost terms on batches of trajectories (4.5.2), and the plain problem of VP-STO for any number of joints.
 
-A term is ranked by its cost; a constraint also says which candidates are valid. Rows of a batch whose duration is infinite
-(a boundary velocity beyond its limit) have an infinite cost and are invalid.
+A term is ranked by its cost; a constraint also says which candidates are valid. Rows of a batch whose
+duration is infinite (a boundary velocity beyond its limit) have an infinite cost and are invalid.
 """
 
 import dataclasses
@@ -66,8 +66,8 @@ def joint_limit_cost(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Eq. (4.16) at the exact extrema of every joint: 1 + excess for every limit that is exceeded, summed.
 
-    Deviations: the thesis accumulates over evaluation points; and a joint exactly on its limit counts as valid, as it does for
-    :meth:`vpsto_ros.trajectory.Trajectory.violations`.
+    Deviations: the thesis accumulates over evaluation points; and a joint exactly on its limit counts as
+    valid, as it does for :meth:`vpsto_ros.trajectory.Trajectory.violations`.
 
     Returns:
         Cost (B,) and validity (B,).
@@ -162,8 +162,8 @@ class JointSpaceProblem:
         goal: final position, shape (n,), or None if it is part of the search.
         start_velocity: shape (n,), zero by default.
         end_velocity: shape (n,), zero by default.
-        collision: maps positions (B, K, n) to collisions (B, K) of bool; None for free space. It sees only the
-            evaluation points, so obstacles need a margin of half the distance between two of them.
+        collision: maps positions (B, K, n) to collisions (B, K) of bool; None for free space. It sees only
+            the evaluation points, so obstacles need a margin of half the distance between two of them.
         terms: further costs, each mapping a batch to cost (B,) and validity (B,); their weights are 1.
         weights: of the other terms.
         samples: evaluation points K.
@@ -211,7 +211,9 @@ class JointSpaceProblem:
         guess = minimal_duration(
             OptimalBasis.uniform(0), ends, self.start_velocity, self.end_velocity, self.limits
         )
-        duration = guess if np.isfinite(guess) else 1.0  # nothing will be valid then, but the prior exists
+        duration = (
+            float(guess) if np.isfinite(guess) else 1.0
+        )  # nothing will be valid then, but the prior exists
         return smoothness_prior(
             self.basis,
             self.start,
@@ -227,7 +229,9 @@ class JointSpaceProblem:
         """Points (B, P, n) between start and goal, shape (B, N + 2, n)."""
         expected = (self.n_points, self.limits.dof)
         if points.ndim != 3 or points.shape[1:] != expected:
-            raise InvalidInputError(f"expected points of shape (B, {expected[0]}, {expected[1]}), got {points.shape}")
+            raise InvalidInputError(
+                f"expected points of shape (B, {expected[0]}, {expected[1]}), got {points.shape}"
+            )
         keys = np.empty((len(points), self.basis.n_via + 2, self.limits.dof))
         keys[:, 0] = self.start
         keys[:, 1 : 1 + self.n_points] = points
@@ -239,7 +243,12 @@ class JointSpaceProblem:
         """Costs of candidates (B, P, n), for :func:`vpsto_ros.optimization.vpsto.search`."""
         weights, bounds = self.weights, (self.start_velocity, self.end_velocity)
         batch = synthesize_batch(
-            self.basis, self.key_positions(points), *bounds, self.limits, self.samples, derivatives=bool(self.terms)
+            self.basis,
+            self.key_positions(points),
+            *bounds,
+            self.limits,
+            self.samples,
+            derivatives=bool(self.terms),
         )
         valid = np.isfinite(batch.duration)
         cost = weights.duration * duration_cost(batch)
@@ -284,7 +293,7 @@ def _extrema_kernel(knots, keys, slopes):
                 c2, c3 = 3.0 * step - 2.0 * c1 - right, c1 + right - 2.0 * step
                 lowest[b, j] = min(lowest[b, j], q + step)
                 highest[b, j] = max(highest[b, j], q + step)
-                # Roots of the slope c1 + 2 c2 u + 3 c3 u^2; q / 0 is infinite or NaN and fails the test below.
+                # Roots of the slope c1 + 2 c2 u + 3 c3 u^2; division by zero fails the test below.
                 discriminant = c2 * c2 - 3.0 * c1 * c3
                 if discriminant < 0.0:
                     continue

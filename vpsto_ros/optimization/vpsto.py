@@ -1,7 +1,8 @@
 """VP-STO (4.3): stochastic search over via-points in the latent space of a Gaussian prior.
 
-The search knows nothing about trajectories: it draws via-points, hands them to ``evaluate`` in one batch and keeps the best
-valid ones. :class:`vpsto_ros.optimization.costs.JointSpaceProblem` is the plain problem of the thesis.
+The search knows nothing about trajectories: it draws via-points, hands them to ``evaluate`` in one batch and
+keeps the best valid ones. :class:`vpsto_ros.optimization.costs.JointSpaceProblem` is the plain problem of the
+thesis.
 """
 
 import dataclasses
@@ -28,12 +29,16 @@ class VpstoConfig:
 
     population: int = option(32, "candidates per iteration and start", minimum=4, maximum=100_000)
     iterations: int = option(6, "iterations in total, restarts included", minimum=1, maximum=1_000_000)
-    restarts: int = option(1, "how often to begin anew, wider, while nothing valid is known", minimum=0, maximum=100)
+    restarts: int = option(
+        1, "how often to begin anew, wider, while nothing valid is known", minimum=0, maximum=100
+    )
     restart_widening: float = option(2.0, "factor on sigma at every restart", minimum=1.0, maximum=100.0)
     starts: int = option(1, "independent starts searched side by side", minimum=1, maximum=1000)
     strategy: str = option("sep-cma", "evolution strategy", choices=STRATEGIES)
     sigma: float = option(1.0, "first standard deviation in units of the prior", minimum=1e-6, maximum=100.0)
-    tolerance: float = option(0.0, "stop when the best cost changes less per iteration; 0: never", minimum=0.0)
+    tolerance: float = option(
+        0.0, "stop when the best cost changes less per iteration; 0: never", minimum=0.0
+    )
 
     def __post_init__(self) -> None:
         validate(self)
@@ -51,8 +56,14 @@ class Evaluation:
 
 
 class Iteration(NamedTuple):
-    """What one iteration saw: its best cost, the best valid cost so far (inf if none), how many candidates were valid, and the
-    step size of the first start."""
+    """What one iteration saw.
+
+    Attributes:
+        best_cost: lowest cost in this iteration, valid or not.
+        best_valid_cost: lowest cost of a valid candidate so far, inf if there was none.
+        valid_count: how many candidates of this iteration were valid.
+        sigma: step size of the first start.
+    """
 
     best_cost: float
     best_valid_cost: float
@@ -68,7 +79,8 @@ class SearchResult:
         points: best valid points, shape (P, n), or None if there are none.
         cost: their cost, inf if there are none.
         valid: whether there are any.
-        best_any_points: points of the lowest finite cost, valid or not, shape (P, n), or None if no cost was finite.
+        best_any_points: points of the lowest finite cost, valid or not, shape (P, n), or None if no cost was
+            finite.
         best_any_cost: their cost, inf if there are none.
         iterations, evaluations, restarts: how often each happened.
         non_finite: number of candidates whose cost was not finite.
@@ -107,28 +119,30 @@ def search(
 ) -> SearchResult:
     """Minimise a cost over via-points, eq. (4.3).
 
-    The populations of all starts are evaluated in one batch. The first one also contains the mean of every start, so a
-    warm start is never worse than what it started from. With more means than starts, all means are evaluated first and
-    the cheapest become starts. While nothing valid is known, the remaining iterations are
-    divided among the remaining restarts; every restart widens sigma. The result is the same for the same ``rng`` as long as no
-    deadline hits.
+    The populations of all starts are evaluated in one batch. The first one also contains the mean of every
+    start, so a warm start is never worse than what it started from. With more means than starts, all means
+    are evaluated first and the cheapest become starts. While nothing valid is known, the remaining iterations
+    are divided among the remaining restarts; every restart widens sigma. The result is the same for the same
+    ``rng`` as long as no deadline hits.
 
     Args:
         prior: Gaussian over the P points; also the metric of the search.
         evaluate: maps points (B, P, n) to an :class:`Evaluation`.
         config: options.
         rng: source of randomness.
-        seeds: points to try in the first population (and again after a restart), shape (S, P, n), distributed over the starts.
+        seeds: points to try in the first population (and again after a restart), shape (S, P, n), distributed
+            over the starts.
         mean: where to start instead of the mean of the prior, shape (P, n).
-        means: several of them, shape (S, P, n), instead of ``mean``. There are ``min(config.starts, S)`` starts, each at its
-            own mean.
+        means: several of them, shape (S, P, n), instead of ``mean``. There are ``min(config.starts, S)``
+            starts, each at its own mean.
         sigma: first standard deviation of this search instead of ``config.sigma``.
-        deadline: time of ``clock`` by which to be back. Checked before every iteration: one that would take as long as the
-            longest so far must still fit.
+        deadline: time of ``clock`` by which to be back. Checked before every iteration: one that would take
+            as long as the longest so far must still fit.
         clock: reads the time in seconds.
 
     Raises:
-        InvalidInputError: shapes do not fit, or ``evaluate`` returned something else than costs (B,) and validity (B,).
+        InvalidInputError: shapes do not fit, or ``evaluate`` returned something else than costs (B,) and
+            validity (B,).
     """
     best, timer = _Incumbents(), _Timer(deadline, clock)
     starts = _latent_starts(prior, config, mean, means)
@@ -267,7 +281,7 @@ def _injections(
     latent = np.empty((0, prior.dimension))
     if seeds is not None and len(seeds):
         latent = prior.to_latent(_points_like(prior, "seeds", seeds))
-        known = (latent[:, None, :] == starts).all(axis=-1).any(axis=1)
+        known = (np.abs(latent[:, None, :] - starts) < 1e-9).all(axis=-1).any(axis=1)
         latent = latent[~known]
     shares = [np.vstack([start, latent[i :: len(starts)]]) for i, start in enumerate(starts)]
     if len(shares[0]) > config.population:
@@ -280,19 +294,21 @@ def _points_like(prior: GaussianPrior, name: str, points: np.ndarray) -> np.ndar
     array = np.asarray(points, dtype=float)
     expected = (prior.n_points, prior.dof)
     if array.ndim != 3 or not len(array) or array.shape[1:] != expected or not np.isfinite(array).all():
-        raise InvalidInputError(f"{name} must be finite points of shape {expected} each, got shape {array.shape}")
+        raise InvalidInputError(
+            f"{name} must be finite points of shape {expected} each, got shape {array.shape}"
+        )
     return array
 
 
 def _widths(config: VpstoConfig, sigma: float | None) -> list[float]:
-    """Step size of the first round and of every restart; a restart is at least as wide as an ordinary search."""
+    """Step size of the first round and of every restart, which is wider than an ordinary search."""
     first = config.sigma if sigma is None else float(sigma)
     widest = max(first, config.sigma)
     return [first] + [widest * config.restart_widening ** (i + 1) for i in range(config.restarts)]
 
 
 def _round_end(config: VpstoConfig, done: int, restarts: int) -> int:
-    """Iteration at which the present round gives up if nothing valid is known: an equal share of what is left."""
+    """Iteration at which the present round gives up if nothing is valid: an equal share of what is left."""
     return done + math.ceil((config.iterations - done) / (config.restarts - restarts + 1))
 
 

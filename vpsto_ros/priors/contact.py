@@ -10,9 +10,9 @@ def contact_factor(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A Gaussian on one key point as a factor over all of them.
 
-    In eq. (6.39) this is written with a covariance that says nothing about the other points, which has no inverse.
-    The precision form exists: it is zero outside the block of the point, and multiplying densities adds precisions and
-    information vectors.
+    In eq. (6.39) this is written with a covariance that says nothing about the other points, which has no
+    inverse. The precision form exists: it is zero outside the block of the point, and multiplying densities
+    adds precisions and information vectors.
 
     Args:
         n_points: number of key points P.
@@ -32,7 +32,9 @@ def contact_factor(
         raise InvalidInputError(f"point_index = {point_index} is out of range for {n_points} points")
     target, spread = np.asarray(mean, dtype=float), np.asarray(covariance, dtype=float)
     if target.shape != (dof,) or spread.shape != (dof, dof):
-        raise InvalidInputError(f"expected mean ({dof},) and covariance ({dof}, {dof}), got {target.shape}, {spread.shape}")
+        raise InvalidInputError(
+            f"expected mean ({dof},) and covariance ({dof}, {dof}), got {target.shape}, {spread.shape}"
+        )
     if not (np.isfinite(target).all() and np.isfinite(spread).all() and np.allclose(spread, spread.T)):
         raise InvalidInputError("mean and covariance must be finite and the covariance symmetric")
     try:

@@ -23,8 +23,8 @@ class GaussianPrior:
         dof: number of degrees of freedom n of a point.
 
     Raises:
-        InvalidInputError: shapes do not fit or a number is not finite; a precision that is not positive definite is
-            found when the covariance is first needed.
+        InvalidInputError: shapes do not fit or a number is not finite; a precision that is not positive
+            definite is found when the covariance is first needed.
     """
 
     mean: np.ndarray
@@ -33,7 +33,12 @@ class GaussianPrior:
 
     def __post_init__(self) -> None:
         size = self.mean.size
-        if self.mean.shape != (size,) or self.precision.shape != (size, size) or self.dof < 1 or size % self.dof:
+        if (
+            self.mean.shape != (size,)
+            or self.precision.shape != (size, size)
+            or self.dof < 1
+            or size % self.dof
+        ):
             raise InvalidInputError(
                 f"expected mean (D,), precision (D, D) and D a multiple of dof; got {self.mean.shape}, "
                 f"{self.precision.shape} and dof = {self.dof}"
@@ -97,7 +102,8 @@ class GaussianPrior:
         """Product of Gaussian densities, renormalised.
 
         Args:
-            other: another prior, or the precision (D, D) of a factor, which may be singular: it is added, never inverted.
+            other: another prior, or the precision (D, D) of a factor, which may be singular: it is added,
+                never inverted.
             information: precision times mean of that factor, shape (D,); not with a prior. See
                 :func:`vpsto_ros.priors.contact.contact_factor`, which returns both.
         """
@@ -109,7 +115,7 @@ class GaussianPrior:
             precision = other
         if precision.shape != self.precision.shape or information.shape != self.mean.shape:
             raise InvalidInputError(
-                f"a factor over {self.dimension} variables is needed, got {precision.shape} and {information.shape}"
+                f"expected a factor over {self.dimension} variables, got {precision.shape}"
             )
         total = self.precision + precision
         mean = self.mean + _solve(total, information - precision @ self.mean)
@@ -126,7 +132,9 @@ class GaussianPrior:
         given[list(indices)] = True
         values = np.asarray(points, dtype=float)
         if values.shape != (np.count_nonzero(given), self.dof):
-            raise InvalidInputError(f"expected points ({np.count_nonzero(given)}, {self.dof}), got {values.shape}")
+            raise InvalidInputError(
+                f"expected points ({np.count_nonzero(given)}, {self.dof}), got {values.shape}"
+            )
         deviation = np.zeros_like(self.mean_points)
         deviation[list(indices)] = values - self.mean_points[list(indices)]
         known = np.repeat(given, self.dof)
@@ -149,9 +157,10 @@ def smoothness_prior(
 ) -> GaussianPrior:
     """Eq. (4.15): the Gaussian over via-points that favours low acceleration, given the boundary conditions.
 
-    Its density is exp(-J_s / scale^2) with J_s = 1/2 int q''(s)^T R q''(s) ds over phase and R = diag(weights), the integral
-    being exact. Two deviations from the text: the conditional mean is -R_via^{-1} R_via,bc w_bc, with the minus sign that
-    conditioning gives; and without ``end`` the final position is one more variable (the last point), its velocity given.
+    Its density is exp(-J_s / scale^2) with J_s = 1/2 int q''(s)^T R q''(s) ds over phase and R =
+    diag(weights), the integral being exact. Two deviations from the text: the conditional mean is -R_via^{-1}
+    R_via,bc w_bc, with the minus sign that conditioning gives; and without ``end`` the final position is one
+    more variable (the last point), its velocity given.
 
     Args:
         basis: optimal basis with N via-points.
@@ -159,17 +168,17 @@ def smoothness_prior(
         start_velocity: shape (n,), per second.
         end: final position, shape (n,), or None if it is free.
         end_velocity: shape (n,), per second.
-        duration: guess of the movement duration in seconds, because the boundary slopes of eq. (4.2) are q' = T qdot and T
-            is known only after the via-points; the duration of the direct trajectory is a good guess. It moves the mean
-            only when a boundary velocity is not zero.
+        duration: guess of the movement duration in seconds, because the boundary slopes of eq. (4.2) are q' =
+            T qdot and T is known only after the via-points; the duration of the direct trajectory is a good
+            guess. It moves the mean only when a boundary velocity is not zero.
         weights: diagonal of R, shape (n,), positive; ones by default. A larger weight means less variation.
         scale: factor on the standard deviations.
-        spread: if given, overrides ``scale`` such that the marginal standard deviations of all the coordinates average to
-            this value, in the unit of the positions.
+        spread: if given, overrides ``scale`` such that the marginal standard deviations of all the
+            coordinates average to this value, in the unit of the positions.
 
     Returns:
-        Prior over the N via-points (P = N), or over the via-points and the final position (P = N + 1). P = 0 is an empty
-        prior.
+        Prior over the N via-points (P = N), or over the via-points and the final position (P = N + 1). P = 0
+        is an empty prior.
 
     Raises:
         InvalidInputError: an argument has the wrong shape, is not finite or not positive.
@@ -219,7 +228,11 @@ def _boundary(
 
 def _positive(name: str, value: np.ndarray | float, size: int | None = None) -> np.ndarray:
     array = np.asarray(value, dtype=float)
-    if array.shape != (() if size is None else (size,)) or not np.isfinite(array).all() or not (array > 0).all():
+    if (
+        array.shape != (() if size is None else (size,))
+        or not np.isfinite(array).all()
+        or not (array > 0).all()
+    ):
         shape = "a number" if size is None else f"shape ({size},)"
         raise InvalidInputError(f"{name} must be {shape}, finite and positive; got {value!r}")
     return array
