@@ -1,13 +1,9 @@
 """The ``vpsto`` command: demos over ROS 2 topics, experiments in lock-step, benchmarks."""
 
-import os
-
-# Before NumPy is imported anywhere: two BLAS threads on a busy two-core machine slow small products down many times.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import argparse
 import importlib
 import math
+import os
 import sys
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -26,7 +22,7 @@ examples:
 exit status: 0 success, 1 the run failed, 2 the command was not understood
 """
 
-DEMOS = {"push_box": "sim_bridge.demo"}
+DEMOS = {"push_box": "sim_bridge.demo.push_box"}
 EXPERIMENTS = {"push_box": "sim_bridge.experiments.push_box", "push_t": "sim_bridge.experiments.push_t"}
 
 
@@ -77,9 +73,11 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"vpsto {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     demo = commands.add_parser("demo", help="run the nodes as separate processes over ROS 2 topics and judge the run")
-    _add_modules(demo, "DEMO", DEMOS, chosen, _demo_arguments)
+    _add_modules(demo, "DEMO", DEMOS, chosen[1:2] if chosen[:1] == ["demo"] else (), _demo_arguments)
     experiment = commands.add_parser("experiment", help="repeat a task many times in lock-step, without ROS")
-    _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, chosen, _experiment_arguments)
+    _add_modules(
+        experiment, "EXPERIMENT", EXPERIMENTS, chosen[1:2] if chosen[:1] == ["experiment"] else (), _experiment_arguments
+    )
     bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
     bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
     bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")

@@ -15,30 +15,25 @@ DRIFT_MEDIAN_DISTANCE = 0.025
 
 
 @dataclass(frozen=True)
-class Sector:
-    """The part of the table where targets are: a sector of a ring around the robot's base.
+class Area:
+    """The part of the table where targets are, well inside the planner's default workspace for objects.
 
     Attributes:
-        radius: smallest and largest distance from the base [m].
-        angle: largest angle to either side of straight ahead [rad].
+        x: range in x [m], base frame.
+        y: range in y [m].
     """
 
-    radius: tuple[float, float] = (0.42, 0.60)
-    angle: float = math.radians(38.0)
-
-    def point(self, radius: float, angle: float) -> NDArray[np.float64]:
-        """Cartesian coordinates (2,) [m] of a point given in polar ones."""
-        return radius * np.array([math.cos(angle), math.sin(angle)])
+    x: tuple[float, float] = (0.44, 0.60)
+    y: tuple[float, float] = (-0.25, 0.25)
 
     def contains(self, point: NDArray[np.float64]) -> bool:
-        """Whether a point (2,) [m] lies in the sector."""
-        radius, angle = math.hypot(*point), math.atan2(point[1], point[0])
-        return self.radius[0] <= radius <= self.radius[1] and abs(angle) <= self.angle
+        """Whether a point (2,) [m] lies in the area."""
+        return bool(self.x[0] <= point[0] <= self.x[1] and self.y[0] <= point[1] <= self.y[1])
 
     def sample(self, rng: np.random.Generator, away_from: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
         """A random point (2,) that keeps a distance [m] from another one."""
         while True:
-            point = self.point(rng.uniform(*self.radius), rng.uniform(-self.angle, self.angle))
+            point = np.array([rng.uniform(*self.x), rng.uniform(*self.y)])
             if np.linalg.norm(point - away_from) >= distance:
                 return point
 
@@ -131,12 +126,12 @@ class Scenario:
     Attributes:
         rng: chooses the targets and the knock.
         duration: the longest the scenario may take [s]; the drift takes a fifth of it.
-        sector: where targets are.
+        area: where targets are.
     """
 
     rng: np.random.Generator
     duration: float = 60.0
-    sector: Sector = field(default_factory=Sector)
+    area: Area = field(default_factory=Area)
 
     def __post_init__(self) -> None:
         """Lay out the phases."""
@@ -215,11 +210,11 @@ class Scenario:
             return
         self.phase.start = now
         if self.phase.name.startswith("target"):
-            self._goal = self.sector.sample(self.rng, box, distance=0.15)
+            self._goal = self.area.sample(self.rng, box, distance=0.15)
         elif self.phase.name == "knock":
             self._knock = self._aim(box, tool)
         elif self.phase.name == "drift":
-            self._drift_direction = -1.0 if math.atan2(self._goal[1], self._goal[0]) > 0.0 else 1.0
+            self._drift_direction = -1.0 if self._goal[1] > 0.0 else 1.0
 
     def _aim(self, box: NDArray[np.float64], tool: NDArray[np.float64]) -> Knock:
         """A shove of 5 to 10 cm, away from the tool, that leaves the box among the targets."""
@@ -227,13 +222,12 @@ class Scenario:
         for spread in np.linspace(0.3, math.pi, 200):
             angle, distance = away + self.rng.uniform(-spread, spread), self.rng.uniform(0.06, 0.09)
             direction = np.array([math.cos(angle), math.sin(angle)])
-            if self.sector.contains(box + distance * direction):
+            if self.area.contains(box + distance * direction):
                 break
         return Knock(direction, distance)
 
     def _drift(self, elapsed: float) -> None:
-        """Along the arc around the base, turning back at the sector's edge."""
-        radius, angle = math.hypot(*self._goal), math.atan2(self._goal[1], self._goal[0])
-        if angle * self._drift_direction >= self.sector.angle:
+        """Sideways in front of the robot, turning back at the edge of the area."""
+        if not self.area.y[0] < self._goal[1] + 0.005 * self._drift_direction < self.area.y[1]:
             self._drift_direction = -self._drift_direction
-        self._goal = self.sector.point(radius, angle + self._drift_direction * DRIFT_SPEED * elapsed / radius)
+        self._goal = self._goal + np.array([0.0, self._drift_direction * DRIFT_SPEED * elapsed])

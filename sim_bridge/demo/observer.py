@@ -1,0 +1,219 @@
+"""The demo's own ROS node: records every topic, moves the target, lends the hand that knocks the box."""
+
+from __future__ import annotations
+
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseArray, PoseStamped, PoseWithCovarianceStamped, WrenchStamped
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
+
+from sim_bridge.demo.scenario import Orders, Scenario
+from sim_bridge.report.bag import BagRecorder
+from sim_bridge.report.recording import GOAL_POSE, GROUND_TRUTH, JOINT_STATES, JOINT_TRAJECTORY, planar
+from vpsto_ros.robot.kinematics import forward_kinematics_batch
+
+CLOCK, DISTURBANCE = "/clock", "/disturbance"
+GOAL_PERIOD = 0.05
+LATCHED = {
+    "/contact_plan": Odometry,
+    "/franka_driver/markers": MarkerArray,
+    "/state_estimator/markers": MarkerArray,
+    "/contact_planner/markers": MarkerArray,
+    "/mpc_planner/markers": MarkerArray,
+}
+TOPICS = {
+    CLOCK: Clock,
+    JOINT_STATES: JointState,
+    JOINT_TRAJECTORY: JointTrajectory,
+    GROUND_TRUTH: Odometry,
+    GOAL_POSE: PoseStamped,
+    "/object_pose": PoseWithCovarianceStamped,
+    "/object_state": Odometry,
+    "/object_belief": PoseArray,
+    "/external_wrench": WrenchStamped,
+    DISTURBANCE: WrenchStamped,
+    "/diagnostics": DiagnosticArray,
+    **LATCHED,
+}
+
+
+class Observer(Node):
+    """Listens to everything without interpreting more than it must, and acts out a scenario.
+
+    Messages stay serialised on their way into the bag; only what the scenario or a viewer needs is decoded.
+    """
+
+    def __init__(self, bag: BagRecorder, scenario: Scenario, frame: str = "fr3_link0") -> None:
+        """Subscribe to all topics.
+
+        Args:
+            bag: gets every message.
+            scenario: acted out once :meth:`begin` was called.
+            frame: of all poses.
+        """
+        super().__init__("demo")
+        self._bag, self._scenario, self._frame = bag, scenario, frame
+        self._latest: dict[str, bytes] = {}
+        self._running = False
+        self._goal: NDArray[np.float64] | None = None
+        self._goal_published = -math.inf
+        self.simulated_time = 0.0
+        self.first_plan: float | None = None
+        self._goals = self.create_publisher(PoseStamped, GOAL_POSE, QoSProfile(depth=1))
+        self._forces = self.create_publisher(WrenchStamped, DISTURBANCE, QoSProfile(depth=5))
+        for topic, kind in TOPICS.items():
+            bag.add_topic(topic, f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}")
+            self.create_subscription(kind, topic, self._receiver(topic), _quality(topic), raw=True)
+
+    def begin(self) -> None:
+        """Start the scenario with the next message about the object."""
+        self._running = True
+
+    def subscribers_of_goal(self) -> int:
+        """How many others listen to the target."""
+        return self._goals.get_subscription_count() - 1
+
+    def latest(self, topic: str) -> Any:
+        """The newest message of a topic, or None."""
+        data = self._latest.get(topic)
+        return None if data is None else deserialize_message(data, TOPICS[topic])
+
+    def joints(self) -> NDArray[np.float64] | None:
+        """The newest joint positions (n,) [rad], or None."""
+        message = self.latest(JOINT_STATES)
+        return None if message is None else np.array(message.position)
+
+    def object_pose(self) -> NDArray[np.float64] | None:
+        """The newest true pose of the object: x, y [m] and yaw [rad], or None."""
+        message = self.latest(GROUND_TRUTH)
+        return None if message is None else np.array(planar(message.pose.pose))
+
+    def goal(self) -> NDArray[np.float64] | None:
+        """The target's position (2,) [m], or None before the first one."""
+        return self._goal
+
+    def _receiver(self, topic: str) -> Callable[[bytes], None]:
+        def receive(data: bytes) -> None:
+            if topic == CLOCK:
+                # A 4-byte header, then seconds and nanoseconds: no need to build a message hundreds of times per second.
+                seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+                self.simulated_time = seconds + 1e-9 * nanoseconds
+            self._latest[topic] = data
+            self._bag.write(topic, self.simulated_time, data)
+            if topic == JOINT_TRAJECTORY and self._goal is not None and self.first_plan is None:
+                self.first_plan = time.monotonic()
+            if topic == GROUND_TRUTH and self._running:
+                self._act()
+
+        return receive
+
+    def _act(self) -> None:
+        message, joints = self.latest(GROUND_TRUTH), self.joints()
+        if joints is None or self._scenario.finished:
+            return
+        now = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        box = np.array(planar(message.pose.pose)[:2])
+        tool = forward_kinematics_batch(joints[None])[0, :2]
+        self._carry_out(self._scenario.step(now, box, tool), now)
+
+    def _carry_out(self, orders: Orders, now: float) -> None:
+        changed = self._goal is None or not np.allclose(orders.goal, self._goal, atol=1e-9)
+        if changed and (not orders.goal_moves or now - self._goal_published >= GOAL_PERIOD):
+            self._goal, self._goal_published = orders.goal, now
+            message = PoseStamped()
+            message.header.frame_id = self._frame
+            message.header.stamp = _stamp(now)
+            message.pose.position.x, message.pose.position.y = map(float, orders.goal)
+            message.pose.orientation.w = 1.0
+            self._goals.publish(message)
+        if orders.force is not None:
+            wrench = WrenchStamped()
+            wrench.header.frame_id = self._frame
+            wrench.header.stamp = _stamp(now)
+            wrench.wrench.force.x, wrench.wrench.force.y = map(float, orders.force)
+            self._forces.publish(wrench)
+
+
+class Activity:
+    """Watches over the lifecycle states of the nodes."""
+
+    def __init__(self, node: Node, names: tuple[str, ...]) -> None:
+        """Prepare to ask these nodes."""
+        self._clients = {name: node.create_client(GetState, f"/{name}/get_state") for name in names}
+        self._asked: dict[str, Any] = {}
+        self.waiting = set(names)
+
+    def poll(self) -> bool:
+        """Ask those that were not active yet.
+
+        Returns:
+            Whether all are active.
+        """
+        for name in sorted(self.waiting):
+            future = self._asked.get(name)
+            if future is not None and future.done():
+                if future.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+                    self.waiting.discard(name)
+                self._asked.pop(name)
+            elif future is None and self._clients[name].service_is_ready():
+                self._asked[name] = self._clients[name].call_async(GetState.Request())
+        return not self.waiting
+
+
+class Spinning:
+    """Runs a node's callbacks in a thread while a block is executed."""
+
+    def __init__(self, node: Node) -> None:
+        """Prepare to spin this node."""
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
+        self.failure: BaseException | None = None
+
+    def _spin(self) -> None:
+        try:
+            self._executor.spin()
+        except BaseException as error:  # handed to the main thread, which sees `failure`
+            self.failure = error
+
+    def __enter__(self) -> Spinning:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown(timeout_sec=5.0)
+        self._thread.join(timeout=5.0)
+
+
+def _quality(topic: str) -> QoSProfile:
+    # A best-effort subscriber hears every publisher; what is latched must be asked for as such.
+    if topic in LATCHED:
+        return QoSProfile(
+            depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+        )
+    return QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def _stamp(seconds: float) -> Any:
+    from builtin_interfaces.msg import Time
+
+    whole = math.floor(seconds)
+    return Time(sec=whole, nanosec=min(round((seconds - whole) * 1e9), 999_999_999))

@@ -1,0 +1,244 @@
+"""``vpsto demo push_box``: the four nodes as processes of their own, a target that moves, a verdict and pictures."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import random
+import signal
+import sys
+import time
+import webbrowser
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from tqdm import tqdm
+
+from sim_bridge.demo.artifacts import write_artifacts
+from sim_bridge.demo.observer import Activity, Observer, Spinning
+from sim_bridge.demo.processes import ProcessGroup
+from sim_bridge.demo.scenario import Phase, Scenario
+from sim_bridge.demo.settings import Settings
+from sim_bridge.report.bag import BagRecorder
+from sim_bridge.report.recording import Recording
+from sim_bridge.report.summary import RunFacts, summarize
+from vpsto_ros.exceptions import VpstoError
+from vpsto_ros.robot.kinematics import fr3_pusher
+
+NODES = {
+    "franka_driver": "sim_bridge.franka_driver",
+    "state_estimator": "vpsto_ros.nodes.state_estimator",
+    "contact_planner": "vpsto_ros.nodes.contact_planner",
+    "mpc_planner": "vpsto_ros.nodes.mpc_planner",
+}
+START_PATIENCE = 180.0
+"""How long the nodes may take to become active [s]; without a kernel cache they compile for a minute or two."""
+
+
+@dataclass
+class Outcome:
+    """What the run itself leaves for the summary.
+
+    Attributes:
+        scenario: with the phases as they went.
+        first_plan: from the start of the processes to the first plan [s].
+        elapsed: wall time of the scenario [s].
+        trouble: what went wrong with the processes, in words.
+    """
+
+    scenario: Scenario
+    first_plan: float = math.nan
+    elapsed: float = math.nan
+    trouble: list[str] | None = None
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the demo.
+
+    Args:
+        arguments: seed, duration [s], out, viewer and real_time_factor, as the command line gives them.
+
+    Returns:
+        0 when the box followed the target as it should, else 1.
+
+    Raises:
+        VpstoError: when the nodes did not start.
+    """
+    signal.signal(signal.SIGTERM, _interrupt)
+    out = Path(arguments.out)
+    out.mkdir(parents=True, exist_ok=True)
+    settings = Settings.load("push_box", arguments.seed, arguments.real_time_factor)
+    bag = BagRecorder(out / "bag")
+    try:
+        outcome = _run_nodes(arguments, settings, bag, out)
+    finally:
+        bag.close()
+    print("making pictures, replay and video ...", flush=True)
+    recording = Recording.from_bag(out / "bag")
+    facts = RunFacts(
+        arguments.seed, outcome.first_plan, outcome.elapsed, outcome.trouble or [], settings.scene.tool_height
+    )
+    summary = summarize(recording, outcome.scenario, fr3_pusher(), facts)
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    notes = write_artifacts(out, recording, summary, settings, verdict(summary))
+    print(verdict(summary))
+    for note in notes:
+        print(note)
+    print(f"report: {out / 'report.html'}   bag for Foxglove: {out / 'bag'}")
+    return 0 if summary["success"] else 1
+
+
+def verdict(summary: dict[str, Any]) -> str:
+    """The outcome in plain words."""
+    if not summary["success"]:
+        return "FAILED: " + "; ".join(summary["failures"])
+    times = [phase["time_to_reach_s"] for phase in summary["phases"] if phase["name"] != "drift"]
+    return (
+        f"SUCCESS: the box came to rest at every target within {max(times):.1f} s, kept "
+        f"{summary['drift']['median_distance_m'] * 1e3:.0f} mm to the drifting one (median) and ended "
+        f"{summary['final_error_m'] * 1e3:.1f} mm from it; no limit was violated, "
+        f"{summary['mpc']['deadline_misses']:.0f} of {summary['mpc']['cycles']:.0f} replanning deadlines were missed."
+    )
+
+
+def _run_nodes(arguments: argparse.Namespace, settings: Settings, bag: BagRecorder, out: Path) -> Outcome:
+    """From the first process to the last."""
+    scenario = Scenario(np.random.default_rng(arguments.seed), arguments.duration)
+    outcome = Outcome(scenario)
+    environment = _private_network()
+    began = time.monotonic()
+    with ProcessGroup(out / "logs", environment) as processes:
+        for name, module in NODES.items():
+            processes.start(name, [sys.executable, "-m", module, *settings.ros_arguments(name)])
+        with _observer(bag, scenario, environment) as observer:
+            _wait_until_active(observer, processes)
+            with _viewer(arguments.viewer, settings) as show:
+                started = time.monotonic()
+                observer.begin()
+                patience = 60.0 + 4.0 * arguments.duration / min(arguments.real_time_factor, 1.0)
+                _watch(observer, processes, scenario, show, started + patience)
+            outcome.elapsed = time.monotonic() - started
+            if observer.first_plan is not None:
+                outcome.first_plan = observer.first_plan - began
+            ended = processes.ended()
+        outcome.trouble = [f"{name} ended during the run" for name in ended]
+        if not scenario.finished and not ended:
+            outcome.trouble.append("the simulation did not get to the end of the scenario in time")
+        codes = processes.stop()
+    outcome.trouble += [f"{name} exited with status {code}" for name, code in codes.items() if code != 0]
+    for name, code in codes.items():
+        if code != 0:
+            print(f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}", file=sys.stderr)
+    return outcome
+
+
+def _private_network() -> dict[str, str]:
+    """A ROS domain of our own on this machine: other ROS programs neither disturb the demo nor hear it."""
+    environment = {
+        # Linux leaves room for 102 domains below its ephemeral ports.
+        "ROS_DOMAIN_ID": str(random.SystemRandom().randrange(1, 102)),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "OPENBLAS_NUM_THREADS": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
+    os.environ.update(environment)
+    return environment
+
+
+@contextlib.contextmanager
+def _observer(bag: BagRecorder, scenario: Scenario, environment: dict[str, str]) -> Iterator[Observer]:
+    # Signals are ours: Ctrl-C must reach the code that stops the processes.
+    rclpy.init(domain_id=int(environment["ROS_DOMAIN_ID"]), signal_handler_options=SignalHandlerOptions.NO)
+    observer = Observer(bag, scenario)
+    try:
+        with Spinning(observer):
+            yield observer
+    finally:
+        observer.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _wait_until_active(observer: Observer, processes: ProcessGroup) -> None:
+    print("starting the nodes ...", flush=True)
+    activity = Activity(observer, tuple(NODES))
+    deadline = time.monotonic() + START_PATIENCE
+    while not (activity.poll() and observer.subscribers_of_goal() >= 2 and observer.object_pose() is not None):
+        for name in processes.ended():
+            raise VpstoError(
+                f"{name} ended while starting; the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}"
+            )
+        if time.monotonic() > deadline:
+            waiting = ", ".join(sorted(activity.waiting)) or "their topics"
+            raise VpstoError(f"the nodes were not ready after {START_PATIENCE:.0f} s, waiting for {waiting}")
+        time.sleep(0.02)
+
+
+def _watch(observer: Observer, processes: ProcessGroup, scenario: Scenario, show: Any, deadline: float) -> None:
+    """Show progress until the scenario is over, a process has ended or the deadline has passed."""
+    announced: set[str] = set()
+    with tqdm(total=100, disable=None, bar_format="{desc} |{bar}| {elapsed}") as bar:
+        while not scenario.finished and not processes.ended() and time.monotonic() < deadline:
+            time.sleep(0.05)
+            show(observer)
+            _announce(scenario, announced)
+            pose, goal = observer.object_pose(), observer.goal()
+            if pose is not None and goal is not None:
+                distance = float(np.linalg.norm(pose[:2] - goal)) * 1e3
+                bar.set_description_str(f"{scenario.phase.name:9s} {distance:5.0f} mm to target", refresh=False)
+            bar.n = round(100 * scenario.progress)
+            bar.refresh()
+    _announce(scenario, announced)
+
+
+def _announce(scenario: Scenario, announced: set[str]) -> None:
+    for phase in scenario.phases:
+        if math.isfinite(phase.end) and phase.name not in announced:
+            announced.add(phase.name)
+            tqdm.write(_sentence(phase, scenario))
+
+
+def _sentence(phase: Phase, scenario: Scenario) -> str:
+    if phase.name == "drift":
+        median = float(np.median(scenario.drift_distances)) * 1e3
+        return f"  drift      the target moved at 2 cm/s; median distance {median:.0f} mm"
+    if math.isnan(phase.reached):
+        return f"  {phase.name:9s}  NOT reached within {phase.timeout:.0f} s"
+    return f"  {phase.name:9s}  reached after {phase.time_to_reach:.1f} s"
+
+
+@contextlib.contextmanager
+def _viewer(wanted: bool, settings: Settings) -> Iterator[Any]:
+    """A function that brings the live view up to date with an observer."""
+    if not wanted:
+        yield lambda observer: None
+        return
+    from sim_bridge.report.view import CellView, Frame, open_server
+    from sim_bridge.scene import build
+
+    server = open_server()
+    address = f"http://127.0.0.1:{server.get_port()}"
+    print(f"live view: {address}", flush=True)
+    webbrowser.open(address)
+    view = CellView(server, build(settings.scene), fr3_pusher().joint_names)
+
+    def show(observer: Observer) -> None:
+        joints = observer.joints()
+        if joints is not None:
+            view.show(Frame(joints, observer.object_pose(), observer.goal()))
+
+    try:
+        yield show
+    finally:
+        server.stop()
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
