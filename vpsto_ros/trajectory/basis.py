@@ -103,7 +103,7 @@ class OptimalBasis:
             self.knot_slopes[segment],
             self.knot_slopes[segment + 1],
         )
-        return sum(weight[:, None] * term for weight, term in zip(weights, terms, strict=True))
+        return np.einsum("tk,tkp->kp", np.stack(weights), np.stack(terms))
 
     def gramian(self) -> NDArray[np.float64]:
         """The effort as a quadratic form: G (N + 4, N + 4) with integral of q''(s)^2 ds = w^T G w.
@@ -135,7 +135,7 @@ def _knot_slopes(knots: NDArray[np.float64]) -> NDArray[np.float64]:
     for i in range(1, size - 1):
         left[i, i - 1 : i + 2] = g[i - 1], 2.0 * (g[i - 1] + g[i]), g[i]
         right[i, i - 1 : i + 2] = -3.0 * g[i - 1] ** 2, 3.0 * (g[i - 1] ** 2 - g[i] ** 2), 3.0 * g[i] ** 2
-    slopes = np.linalg.solve(left, right)
+    slopes: NDArray[np.float64] = np.linalg.solve(left, right)
     # The end slopes are given numbers: no round-off of the solver may leak into them.
     slopes[[0, -1]] = right[[0, -1]]
     return slopes

@@ -44,7 +44,9 @@ def hermite_coefficients(
     c[:, 2] = (3.0 * chord - 2.0 * v[:-1] - v[1:]) / h
     c[:, 3] = (v[:-1] + v[1:] - 2.0 * chord) / h**2
     if accelerations is not None:
-        _raise_to_quintic(c, h, q, v, _matrix("accelerations", accelerations, times.size, q.shape[1]))
+        _raise_to_quintic(
+            c, h, q, v, _matrix("accelerations", accelerations, times.size, q.shape[1], missing=True)
+        )
     return c
 
 
@@ -71,10 +73,14 @@ def _raise_to_quintic(c: NDArray, h: NDArray, q: NDArray, v: NDArray, a: NDArray
     c[:, 5] = (e1 - e0) / (2.0 * h**3)
 
 
-def _matrix(name: str, values: ArrayLike, rows: int, columns: int | None = None) -> NDArray[np.float64]:
+def _matrix(
+    name: str, values: ArrayLike, rows: int, columns: int | None = None, *, missing: bool = False
+) -> NDArray[np.float64]:
     matrix = np.asarray(values, dtype=np.float64)
     if matrix.ndim != 2 or matrix.shape[0] != rows or (columns is not None and matrix.shape[1] != columns):
         raise InvalidInputError(
             f"{name} must have shape ({rows}, {'n' if columns is None else columns}), got {matrix.shape}"
         )
+    if not (np.isfinite(matrix) | (missing & np.isnan(matrix))).all():
+        raise InvalidInputError(f"{name} must be finite")
     return matrix

@@ -52,7 +52,7 @@ def _end_velocity_bound(duration, a0, a1, c, b0, b1, limit):
     gap = limit - b0
     if gap > 0.0:
         return max(duration, a0 / gap)
-    # A boundary velocity on its limit (alpha is zero there): 0/0, whose limit value is the ratio of the slopes.
+    # A boundary velocity on its limit (alpha is zero there): 0/0, and the ratio of the slopes is its value.
     rise, fall = 6.0 * c - 4.0 * a0 - 2.0 * a1, 4.0 * b0 + 2.0 * b1
     return max(duration, rise / fall)
 
@@ -106,7 +106,7 @@ def _end_bound(duration, h, a0, a1, c, b0, b1, velocity, acceleration):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _inner_bound(duration, a0, a1, c, b0, b1, velocity, reach):
     """The shortest duration, not below the given one, that keeps the velocity limit inside a segment."""
-    # The middle control point of the Bernstein form, together with the two feasible ends, bounds the velocity.
+    # The middle control point of the Bernstein form and the two feasible ends together bound the velocity.
     if abs(3.0 * c - a0 - a1 - duration * (b0 + b1)) <= duration * velocity:
         return duration
     for sign in (1.0, -1.0):
@@ -131,8 +131,8 @@ def _minimal_duration(knots, keys, start, end, alpha, beta, velocity, accelerati
             duration = _end_bound(duration, h, a0, a1, c, b0, b1, velocity[j], acceleration[j])
             if i == last:
                 duration = _end_bound(duration, h, a1, a0, c, b1, b0, velocity[j], acceleration[j])
-    # A second pass: the tests for the inside of a segment need its two ends to be feasible. Near an end on the
-    # limit alpha and limit - beta both vanish, so u counts from that end, and from both in a lone segment.
+    # A second pass: the tests for the inside of a segment need its two ends to be feasible. Near an end on
+    # the limit alpha and limit - beta both vanish, so u counts from that end, from both in a lone segment.
     reach = 0.5 if last == 0 else 1.0
     for i in range(last + 1):
         h = knots[i + 1] - knots[i]
@@ -175,17 +175,18 @@ def _cubic_segments(knots, keys, alpha, beta, duration, cubic):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleration, segment, u, derivatives):
-    """Minimal durations (B,) and samples (3, B, K, n) of position, velocity and acceleration, or (1, B, K, n)."""
+    """Minimal durations (B,) and samples (3, B, K, n) of q, q̇ and q̈, or (1, B, K, n) of q alone."""
     batch, size, dof = keys.shape
     duration = np.empty(batch)
-    # One block: the allocator hands large separate ones back to the system, and page faults then cost more than
-    # all the arithmetic.
-    out = np.zeros((3 if derivatives else 1, batch, u.size, dof))
+    # One block: the allocator hands separate large ones back to the system, and the page faults then cost
+    # more than all the arithmetic.
+    out = np.empty((3 if derivatives else 1, batch, u.size, dof))
     alpha, beta, cubic = np.empty((size, dof)), np.empty((size, dof)), np.empty((size - 1, 4, dof))
     for b in range(batch):
         _slopes(knot_slopes, keys[b], start[b], end[b], alpha, beta)
         duration[b] = _minimal_duration(knots, keys[b], start[b], end[b], alpha, beta, velocity, acceleration)
         if duration[b] == np.inf:
+            out[:, b] = 0.0
             out[0, b] = keys[b, 0]
             continue
         _cubic_segments(knots, keys[b], alpha, beta, duration[b], cubic)

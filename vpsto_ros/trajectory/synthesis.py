@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.trajectory.basis import OptimalBasis
-from vpsto_ros.trajectory.interpolation import hermite_coefficients
 from vpsto_ros.trajectory.timing import MINIMUM_DURATION, Limits, minimal_duration
 from vpsto_ros.trajectory.trajectory import Trajectory
 
@@ -46,11 +45,10 @@ def synthesize(
     if duration is not None and not (np.isfinite(duration) and duration > 0.0):
         raise InvalidInputError(f"duration must be positive and finite, got {duration}")
     total = shortest if duration is None else float(duration)
-    ends = total * np.array([start_velocity, end_velocity], dtype=np.float64)
-    slopes = basis.knot_slopes[:, :-2] @ (keys - keys[0]) + basis.knot_slopes[:, -2:] @ ends
-    coefficients = hermite_coefficients(basis.knots, keys, slopes)
-    coefficients /= total ** np.arange(coefficients.shape[1])[:, None]
-    trajectory = Trajectory(start_time + total * basis.knots, coefficients)
+    ends = np.array([start_velocity, end_velocity], dtype=np.float64)
+    by_keys, by_velocity = basis.knot_slopes[:, :-2], basis.knot_slopes[:, -2:]
+    velocities = by_keys @ (keys - keys[0]) / total + by_velocity @ ends
+    trajectory = Trajectory.from_points(start_time + total * basis.knots, keys, velocities)
     if total < shortest:
         # A shorter, isolated duration can be feasible, so the limits decide.
         broken = trajectory.violations(dataclasses.replace(limits, lower=None, upper=None))

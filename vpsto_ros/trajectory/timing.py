@@ -199,8 +199,8 @@ def _prepare(
     expected = (basis.n_via + 2, limits.dof)
     if keys.ndim != 3 or keys.shape[1:] != expected:
         raise InvalidInputError(
-            f"key positions must have shape (B, {expected[0]}, {expected[1]}) for {basis.n_via} via-points and "
-            f"{limits.dof} degrees of freedom, got {np.shape(key_positions)}"
+            f"key positions must have shape (B, {expected[0]}, {expected[1]}) for {basis.n_via} via-points "
+            f"and {limits.dof} degrees of freedom, got {np.shape(key_positions)}"
         )
     if not _all_finite(keys):
         raise InvalidInputError("key positions must be finite")

@@ -1,6 +1,7 @@
 """The trajectory that everything else evaluates: piecewise polynomials in time, with exact extrema."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -247,7 +248,7 @@ class Trajectory:
         return Trajectory(self.times + dt, self.coefficients)
 
 
-def _checked_time(t: float) -> float:
+def _checked_time(t: Any) -> float:
     t = float(t)
     if t != t:
         raise InvalidInputError("the time to evaluate must not be NaN")
