@@ -112,7 +112,7 @@ def start_joints(planner_map, object_pose: NDArray, shape: PlanarShape) -> NDArr
 
 def simulate(trial: Trial, joints: NDArray) -> Simulation:
     """The cell of a trial: camera 2 mm / 1 degree, 40 ms late, 5 % drop-outs."""
-    scene = Scene(plant=trial.plant, object_pose=trial.start, start_joints=joints)
+    scene = Scene(plant=trial.plant, object_pose=tuple(trial.start.tolist()), start_joints=tuple(joints.tolist()))
     return Simulation(scene, seed=trial.seed, camera=CameraConfig())
 
 
@@ -142,7 +142,7 @@ def run_trial(trial: Trial, loop: PushingLoop, workspace: Workspace) -> TrialRes
         seed=trial.seed, success=success, time_to_goal=reached_at - begin if success else None,
         time_to_goal_before_knock=before_knock,
         final_error=float(np.hypot(*(pose[:2] - trial.goal[:2]))), final_yaw_error=abs(float(wrap_angle(pose[2] - trial.goal[2]))),
-        limit_violations=sim.limits.total, left_workspace=not inside, tool_height_error=sim.tool_height_error,
+        limit_violations=sim.limits.violations, left_workspace=not inside, tool_height_error=sim.tool_height_deviation,
         rejected=len(record.rejected), compute=tuple(record.compute), modes=tuple(record.mode), times=np.array(record.time),
         object_path=np.array(record.object_pose), tool_path=np.array(record.tool),
     )  # fmt: skip

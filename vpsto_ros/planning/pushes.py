@@ -121,9 +121,10 @@ class PushRanking:
             tool: present tool position, shape (2,) [m].
         """
         touch, direction = self._starts(model, pose)
-        reach = float(goal.error(pose, model.pressure_radius)) + 0.04
-        steps = int(np.clip(np.ceil(reach / 0.006), 8, 60))
-        lengths = np.linspace(0.0, reach + CLEARANCE, steps)
+        error = float(goal.error(pose, model.pressure_radius))
+        reach = 1.2 * error + 0.02
+        steps = int(np.clip(np.ceil(reach / np.clip(0.25 * error, 0.001, 0.006)), 8, 60))
+        lengths = CLEARANCE * (1.0 - 1e-3) + np.linspace(0.0, reach, steps)
         path = touch[:, None, :] + lengths[None, :, None] * direction[:, None, :]
         poses = rollout(model, pose, path, max_step=0.006).object_pose
         errors = goal.error(poses, model.pressure_radius)

@@ -1,5 +1,6 @@
 """From motions of the tool in the table plane to joint trajectories whose limits hold at every instant."""
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -9,6 +10,9 @@ from vpsto_ros.exceptions import InfeasibleError
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import Robot, forward_kinematics_batch
 from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize
+
+STRETCHES = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
+"""Durations to try, relative to that of the motion in the plane."""
 
 
 def resting(position: NDArray, start: float, end: float) -> Trajectory:
@@ -30,7 +34,7 @@ class TablePath:
 
     The joint trajectory is the spline of ch. 3 through the joint positions of the plane trajectory at evenly spaced times: with
     about 40 ms between key positions its tool stays within a small fraction of a millimetre of the plane. Its limits are those of the
-    joints, and its duration is never below the minimal one (3.16), so they hold by construction.
+    joints, are checked exactly for the duration that is chosen.
 
     Attributes:
         robot: joint limits.
@@ -60,7 +64,7 @@ class TablePath:
         keys = self.table_map.joints(plane(plane.start_time + phases * plane.duration))
         # What differs at the start (a remainder of the spline through the previous key positions) fades out along the way.
         keys = keys + (1.0 - phases[:, None]) ** 3 * (position - keys[0])
-        trajectory = synthesize_at_least(
+        trajectory = synthesize_near(
             OptimalBasis.uniform(count - 1), keys, velocity, self.robot, plane.duration, plane.start_time
         )
         self.check(trajectory)
@@ -78,12 +82,19 @@ class TablePath:
             raise InfeasibleError(f"the tool would leave its plane by {1e3 * worst:.1f} mm (allowed {1e3 * self.height_tolerance:.1f})")
 
 
-def synthesize_at_least(
+def synthesize_near(
     basis: OptimalBasis, keys: NDArray, velocity: NDArray, robot: Robot, duration: float, start_time: float
 ) -> Trajectory:
-    """The timing-optimal spline through joint key positions, stretched to `duration` [s] when it could be shorter."""
+    """The spline through joint key positions with the first feasible duration from `duration` [s] up.
+
+    The key positions are spaced for `duration`, and the arm moves already: with another one the first segment has to catch up, so that
+    durations somewhat above it are often infeasible although it is feasible itself. The rule of 3.2.1, above which *every* duration is
+    feasible, would then pick one several times as long; it is the last resort here.
+    """
     rest = np.zeros_like(velocity)
-    fastest = synthesize(basis, keys, velocity, rest, robot.limits, start_time=start_time)
-    if fastest.duration >= duration:
-        return fastest
-    return synthesize(basis, keys, velocity, rest, robot.limits, duration=duration, start_time=start_time)
+    for stretch in STRETCHES:
+        with contextlib.suppress(InfeasibleError):
+            return synthesize(
+                basis, keys, velocity, rest, robot.limits, duration=stretch * duration, start_time=start_time
+            )
+    return synthesize(basis, keys, velocity, rest, robot.limits, start_time=start_time)
