@@ -15,6 +15,9 @@ from vpsto_ros.planning.goal import PlanarGoal, wrap_angle
 CLEARANCE = 0.004
 """Gap between tool and object where a push begins [m]."""
 
+IDLE_COST = 100.0
+"""What ranks pushes that gain nothing behind all others [s]."""
+
 
 @dataclasses.dataclass(frozen=True)
 class StraightPushes:
@@ -133,6 +136,9 @@ class PushRanking:
         costs = self.error_cost * errors + (travel[:, None] + lengths) / self.speed
         if goal.yaw is None:
             costs = costs + self.rotation_cost * np.abs(poses[..., 2] - pose[2])
+        # A push that gains nothing is no plan, however little the remaining error costs compared with going round the object.
+        idle = errors > error - max(0.1 * error, 0.0005)
+        costs = np.where(idle, costs + IDLE_COST, costs)
         last = costs.argmin(axis=1)
         rows = np.arange(len(touch))
         pushes = StraightPushes(touch, path[rows, last], errors[rows, last], costs[rows, last])

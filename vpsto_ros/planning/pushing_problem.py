@@ -31,8 +31,9 @@ class PushingCosts:
     horizon: float = option(6.0, "longest trajectory that counts as valid", unit="s", minimum=0.5, maximum=60.0)
     minimum_gain: float = option(0.0005, "smallest reduction of the error that makes a candidate valid", unit="m", minimum=0.0, maximum=1.0)
     model_spread: float = option(
-        0.0, "relative spread of the pressure radius over which costs are averaged; 0 plans with one model", minimum=0.0, maximum=0.9
-    )
+        0.0, "relative spread of pressure radius and friction over which costs are averaged; 0 plans with one model",
+        minimum=0.0, maximum=0.9,
+    )  # fmt: skip
     samples: int = option(64, "samples along a trajectory", minimum=8, maximum=1000)
     end_point: str = option("free", "where trajectories end: free, or at the object's centre as in the thesis", choices=("free", "object"))
 
@@ -220,12 +221,15 @@ class PushingProblem:
         return np.concatenate(parts, axis=1)
 
     def _rollouts(self, path: NDArray) -> NDArray:
-        """Object poses (models, B, K, 3) for each of the models."""
+        """Object poses (models, B, K, 3): the nominal model in the middle, a slippery and a sticky one around it."""
         spread = self.costs.model_spread
-        factors = (1.0,) if spread == 0.0 else (1.0 - spread, 1.0, 1.0 + spread)
-        radius = self.model.pressure_radius * np.repeat(factors, len(path))
+        factors = np.array([1.0] if spread == 0.0 else [1.0 - spread, 1.0, 1.0 + spread])
+        per_candidate = np.repeat(factors, len(path))
         tiled = np.tile(path, (len(factors), 1, 1))
-        poses = rollout(self.model, self.pose, tiled, pressure_radius=radius).object_pose
+        poses = rollout(
+            self.model, self.pose, tiled,
+            pressure_radius=self.model.pressure_radius * per_candidate, friction=self.model.friction * per_candidate,
+        ).object_pose  # fmt: skip
         return poses.reshape(len(factors), *path.shape[:2], 3)
 
 
