@@ -61,8 +61,8 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The command line.
 
     Args:
-        chosen: the arguments that will be parsed. Only the demo or experiment named there is imported for its own options, so
-            that ``vpsto --help`` answers at once.
+        chosen: the arguments that will be parsed. Only the experiment named there is imported for its own options, so that
+            ``vpsto --help`` answers at once.
     """
     parser = argparse.ArgumentParser(
         prog="vpsto",
@@ -73,11 +73,11 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"vpsto {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     demo = commands.add_parser("demo", help="run the nodes as separate processes over ROS 2 topics and judge the run")
-    _add_modules(demo, "DEMO", DEMOS, chosen[1:2] if chosen[:1] == ["demo"] else (), _demo_arguments)
+    _add_modules(demo, "DEMO", DEMOS, _demo_arguments)
     experiment = commands.add_parser("experiment", help="repeat a task many times in lock-step, without ROS")
-    _add_modules(
-        experiment, "EXPERIMENT", EXPERIMENTS, chosen[1:2] if chosen[:1] == ["experiment"] else (), _experiment_arguments
-    )
+    experiments = _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, _experiment_arguments)
+    if list(chosen[:1]) == ["experiment"] and chosen[1:2] and chosen[1] in EXPERIMENTS:
+        _load(EXPERIMENTS[chosen[1]]).add_arguments(experiments[chosen[1]])
     bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
     bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
     bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")
@@ -91,17 +91,16 @@ def _add_modules(
     parser: argparse.ArgumentParser,
     noun: str,
     modules: dict[str, str],
-    chosen: Sequence[str],
     add_arguments: Callable[[argparse.ArgumentParser, str], None],
-) -> None:
+) -> dict[str, argparse.ArgumentParser]:
+    """One subcommand per module; returns their parsers by name."""
     names = parser.add_subparsers(dest="name", metavar=noun, required=True, help="one of: " + ", ".join(modules))
+    parsers = {}
     for name, module in modules.items():
-        # "resolve": a module may give one of the common options another default or meaning.
-        options = names.add_parser(name, conflict_handler="resolve")
-        add_arguments(options, name)
-        if name in chosen and hasattr(loaded := _load(module), "add_arguments"):
-            loaded.add_arguments(options)
-        options.set_defaults(module=module)
+        parsers[name] = names.add_parser(name)
+        add_arguments(parsers[name], name)
+        parsers[name].set_defaults(module=module)
+    return parsers
 
 
 def _demo_arguments(parser: argparse.ArgumentParser, name: str) -> None:

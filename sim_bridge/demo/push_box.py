@@ -117,7 +117,8 @@ def _run_nodes(arguments: argparse.Namespace, settings: Settings, bag: BagRecord
     began = time.monotonic()
     with ProcessGroup(out / "logs", environment) as processes:
         for name, module in NODES.items():
-            processes.start(name, [sys.executable, "-m", module, *settings.ros_arguments(name)])
+            code = f"import sys; from {module} import main; sys.exit(main())"
+            processes.start(name, [sys.executable, "-c", code, *settings.ros_arguments(name)])
         with _observer(bag, scenario, environment) as observer:
             _wait_until_active(observer, processes)
             with _viewer(arguments.viewer, settings) as show:

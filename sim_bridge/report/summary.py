@@ -81,8 +81,11 @@ def limit_violations(recording: Recording, robot: Robot) -> dict[str, int]:
         "published_trajectory": sum(bool(command_violations(command, limits)) for command in recording.commands),
     }
     statuses = recording.diagnostics.get(DRIVER, [])
-    counted = _numbers(statuses[-1], "limits.") if statuses else {}
-    return {**counts, **{f"driver_{key}": int(value) for key, value in counted.items()}}
+    if statuses:
+        for key in statuses[-1].values:
+            if key.startswith("limit.") and key.endswith(".instants"):
+                counts["driver_" + key.split(".")[1]] = int(statuses[-1].number(key))
+    return counts
 
 
 def command_violations(command: Command, limits: Limits) -> list[str]:
@@ -135,8 +138,3 @@ def _phase_figures(phase: Any) -> dict[str, Any]:
 
 def _count(joints: JointSeries, broken: Any) -> int:
     return int(np.count_nonzero(broken.any(axis=1))) if len(joints.time) else 0
-
-
-def _numbers(status: Status, prefix: str) -> dict[str, float]:
-    values = {key.removeprefix(prefix): status.number(key) for key in status.values if key.startswith(prefix)}
-    return {key: value for key, value in values.items() if math.isfinite(value)}

@@ -1,0 +1,212 @@
+import math
+
+import numpy as np
+import pytest
+
+from sim_bridge.demo.scenario import Phase, Scenario
+from sim_bridge.report import recording as rec
+from sim_bridge.report.bag import BagRecorder, read_messages, typestore
+from sim_bridge.report.recording import Command, JointSeries, PoseSeries, Recording, Status
+from sim_bridge.report.summary import RunFacts, command_violations, failures, limit_violations, summarize
+from vpsto_ros.robot.inverse_kinematics import TableMap
+from vpsto_ros.robot.kinematics import fr3_pusher
+
+NAMES = [f"fr3_joint{i}" for i in range(1, 8)]
+
+
+def message(kind, **fields):
+    return typestore().types[kind](**fields)
+
+
+def stamp(seconds):
+    whole = math.floor(seconds)
+    return message("builtin_interfaces/msg/Time", sec=whole, nanosec=round((seconds - whole) * 1e9))
+
+
+def header(seconds):
+    return message("std_msgs/msg/Header", stamp=stamp(seconds), frame_id="fr3_link0")
+
+
+def pose(x, y, yaw):
+    return message(
+        "geometry_msgs/msg/Pose",
+        position=message("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
+        orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)),
+    )
+
+
+def odometry(seconds, *planar):
+    zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    twist = message("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    return message(
+        "nav_msgs/msg/Odometry", header=header(seconds), child_frame_id="object",
+        pose=message("geometry_msgs/msg/PoseWithCovariance", pose=pose(*planar), covariance=np.zeros(36)),
+        twist=message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+    )  # fmt: skip
+
+
+def joint_state(seconds, position):
+    values = {"position": position, "velocity": 0.1 * position, "effort": 2.0 * position}
+    return message("sensor_msgs/msg/JointState", header=header(seconds), name=NAMES, **values)
+
+
+def trajectory(seconds, positions):
+    points = [
+        message(
+            "trajectory_msgs/msg/JointTrajectoryPoint", positions=row, velocities=np.zeros(7),
+            accelerations=np.array([]), effort=np.array([]),
+            time_from_start=message("builtin_interfaces/msg/Duration", sec=index, nanosec=500_000_000),
+        )
+        for index, row in enumerate(positions)
+    ]  # fmt: skip
+    return message("trajectory_msgs/msg/JointTrajectory", header=header(seconds), joint_names=NAMES, points=points)
+
+
+def diagnostic(seconds, level, **values):
+    pairs = [message("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
+    status = message(
+        "diagnostic_msgs/msg/DiagnosticStatus", level=level, name="mpc_planner", message="ok", hardware_id="", values=pairs
+    )
+    return message("diagnostic_msgs/msg/DiagnosticArray", header=header(seconds), status=[status])
+
+
+@pytest.fixture
+def bag(tmp_path):
+    written = BagRecorder(tmp_path / "bag")
+    kinds = {
+        rec.JOINT_STATES: "sensor_msgs/msg/JointState",
+        rec.JOINT_TRAJECTORY: "trajectory_msgs/msg/JointTrajectory",
+        rec.GROUND_TRUTH: "nav_msgs/msg/Odometry",
+        rec.GOAL_POSE: "geometry_msgs/msg/PoseStamped",
+        rec.DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    }
+    for topic, kind in kinds.items():
+        written.add_topic(topic, kind)
+    goal = message("geometry_msgs/msg/PoseStamped", header=header(0.0), pose=pose(0.5, 0.2, 0.0))
+    rows = [
+        (rec.JOINT_STATES, 1.0, joint_state(1.0, np.arange(7.0))),
+        (rec.GROUND_TRUTH, 1.0, odometry(1.0, 0.5, 0.0, 3.1)),
+        (rec.GOAL_POSE, 1.5, goal),
+        (rec.JOINT_TRAJECTORY, 1.6, trajectory(1.5, np.ones((3, 7)))),
+        (rec.DIAGNOSTICS, 1.7, diagnostic(1.7, 1, compute_p50_ms="3.25", note="fine")),
+        (rec.JOINT_STATES, 2.0, joint_state(2.0, np.arange(7.0) + 1.0)),
+        (rec.GROUND_TRUTH, 2.0, odometry(2.0, 0.5, 0.1, -3.1)),
+    ]
+    for topic, seconds, content in rows:
+        written.write(topic, seconds, typestore().serialize_cdr(content, kinds[topic]))
+    written.close()
+    return tmp_path / "bag"
+
+
+def test_a_bag_comes_back_as_arrays(bag):
+    run = Recording.from_bag(bag)
+    assert run.joints.time == pytest.approx([1.0, 2.0])
+    assert run.joints.position[1] == pytest.approx(np.arange(7.0) + 1.0)
+    assert run.joints.effort[0] == pytest.approx(2.0 * np.arange(7.0))
+    assert run.object.pose[0] == pytest.approx([0.5, 0.0, 3.1])
+    assert run.commands[0].time == pytest.approx([2.0, 3.0, 4.0])
+    assert run.commands[0].acceleration is None
+    status = run.diagnostics["mpc_planner"][0]
+    assert (status.level, status.number("compute_p50_ms")) == (1, 3.25)
+    assert math.isnan(status.number("note")) and math.isnan(status.number("missing"))
+
+
+def test_the_bag_is_mcap_with_its_message_definitions(bag):
+    files = {file.suffix for file in bag.iterdir()}
+    assert files == {".mcap", ".yaml"}
+    data = next(bag.glob("*.mcap")).read_bytes()
+    assert data.startswith(b"\x89MCAP0\r\n") and data.endswith(b"\x89MCAP0\r\n")
+    assert b"ros2msg" in data and b"float64[36] covariance" in data
+
+
+def test_a_second_run_replaces_the_bag_but_nothing_else(bag, tmp_path):
+    BagRecorder(bag).close()
+    assert list(read_messages(bag, [rec.JOINT_STATES])) == []
+    other = tmp_path / "precious"
+    other.mkdir()
+    (other / "thesis.tex").write_text("x")
+    with pytest.raises(FileExistsError, match="is not a bag"):
+        BagRecorder(other)
+    assert (other / "thesis.tex").exists()
+
+
+def test_poses_are_interpolated_the_short_way_round_and_targets_are_held(bag):
+    run = Recording.from_bag(bag)
+    assert run.object.at(np.array([1.5]))[0] == pytest.approx([0.5, 0.05, math.pi])
+    assert np.isnan(run.goal.held(np.array([1.4]))).all()
+    assert run.goal.held(np.array([1.5, 9.0]))[:, 1] == pytest.approx([0.2, 0.2])
+    time, distance = run.distance()
+    assert time == pytest.approx([2.0])
+    assert distance == pytest.approx([0.1])
+
+
+def good_run():
+    robot = fr3_pusher()
+    time = np.linspace(0.0, 10.0, 1001)
+    joints = np.tile(TableMap(robot, 0.02).joints([(0.5, 0.0)])[0], (time.size, 1))
+    still = np.zeros_like(joints)
+    target = np.tile([0.5, 0.1, 0.0], (time.size, 1))
+    commands = [Command(t, t + np.array([0.0, 1.0]), joints[:2], still[:2], None) for t in np.arange(0.0, 10.0, 0.05)]
+    values = {"compute_p50_ms": "3", "compute_p99_ms": "5", "compute_max_ms": "9", "deadline_misses": "1", "cycles": "200"}
+    diagnostics = {"mpc_planner": [Status(9.9, 0, "ok", values)]}
+    return Recording(
+        JointSeries(time, joints, still, still.copy()), PoseSeries(time, target), PoseSeries(time, target), PoseSeries(time, target),
+        commands, diagnostics,
+    )  # fmt: skip
+
+
+def good_story():
+    story = Scenario(np.random.default_rng(0))
+    story.phases = [Phase(phase.name, phase.timeout, i, i + 1.0, i + 0.5) for i, phase in enumerate(story.phases)]
+    story.drift_distances = [0.01, 0.02, 0.03]
+    return story
+
+
+FACTS = RunFacts(seed=3, first_plan=1.5, elapsed=5.0, trouble=[], tool_height=0.02)
+
+
+def test_a_good_run_is_a_success_with_all_promised_figures():
+    summary = summarize(good_run(), good_story(), fr3_pusher(), FACTS)
+    assert summary["success"] and summary["failures"] == []
+    assert summary["final_error_m"] == pytest.approx(0.0)
+    assert summary["limit_violations"] == 0
+    assert summary["mpc"]["rate_hz"] == pytest.approx(20.0, rel=0.02)
+    assert summary["mpc"]["compute_ms"] == {"p50": 3.0, "p99": 5.0, "max": 9.0}
+    assert summary["mpc"]["deadline_misses"] == 1
+    assert summary["drift"]["median_distance_m"] == pytest.approx(0.02)
+    assert summary["tool_height_deviation_m"] == pytest.approx(0.0, abs=1e-9)
+    assert summary["real_time_factor"] == pytest.approx(2.0)
+
+
+def test_each_shortcoming_fails_the_run():
+    base = summarize(good_run(), good_story(), fr3_pusher(), FACTS)
+    assert failures(base) == []
+    late = [{**phase, "time_to_reach_s": math.nan} if phase["name"] == "knock" else phase for phase in base["phases"]]
+    for change, word in [
+        ({"phases": late}, "knock"),
+        ({"drift": {"median_distance_m": 0.03}}, "30 mm"),
+        ({"drift": {"median_distance_m": math.nan}}, "drift"),
+        ({"limit_violations": 2, "limit_violations_by_kind": {"measured_torque": 2}}, "measured_torque"),
+        ({"mpc": {**base["mpc"], "deadline_miss_fraction": 0.02}}, "2.0%"),
+        ({"mpc": {**base["mpc"], "deadline_miss_fraction": math.nan}}, "deadlines"),
+        ({"tool_height_deviation_m": 0.006}, "6.0 mm"),
+    ]:
+        found = failures({**base, **change})
+        assert len(found) == 1 and word in found[0]
+    trouble = RunFacts(3, 1.5, 5.0, ["mpc_planner exited with status 1"], 0.02)
+    assert not summarize(good_run(), good_story(), fr3_pusher(), trouble)["success"]
+
+
+def test_violations_are_counted_wherever_they_happen():
+    robot, run = fr3_pusher(), good_run()
+    assert sum(limit_violations(run, robot).values()) == 0
+    run.joints.velocity[5, 2] = 1.01 * robot.limits.velocity[2]
+    run.joints.effort[7, 6] = -1.01 * robot.torque_limits[6]
+    run.joints.position[9, 3] = robot.limits.upper[3] + 1e-3
+    start = run.joints.position[0]
+    # A cubic between two resting points is fastest half-way: 1.5 times the mean, between its points.
+    fast = np.stack((start, start + [0.7 * robot.limits.velocity[0], 0, 0, 0, 0, 0, 0]))
+    run.commands.append(Command(1.0, np.array([1.0, 2.0]), fast, np.zeros((2, 7)), None))
+    assert command_violations(run.commands[-1], robot.limits)
+    counts = limit_violations(run, robot)
+    assert counts == {"measured_position": 1, "measured_velocity": 1, "measured_torque": 1, "published_trajectory": 1}

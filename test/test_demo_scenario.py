@@ -1,0 +1,124 @@
+import math
+
+import numpy as np
+import pytest
+
+from sim_bridge.demo.scenario import DRIFT_SPEED, Area, Knock, Scenario
+
+TOOL = np.array([0.4, 0.0])
+PERIOD = 0.02
+
+
+def act(scenario, follow, until=200.0):
+    """Step a scenario; `follow(box, orders)` moves the box. Returns the orders over time."""
+    box, now, history = np.array([0.5, 0.0]), 0.0, []
+    while not scenario.finished and now < until:
+        orders = scenario.step(now, box, TOOL)
+        history.append((now, orders, box.copy()))
+        box = follow(box, orders)
+        now += PERIOD
+    return history
+
+
+def obedient(box, orders):
+    """A box that goes to the target at 0.1 m/s, or where the hand shoves it."""
+    if orders.force is not None and orders.force.any():
+        return box + PERIOD * 0.2 * orders.force / np.linalg.norm(orders.force)
+    step = orders.goal - box
+    return box + step * min(1.0, 0.1 * PERIOD / max(np.linalg.norm(step), 1e-9))
+
+
+def scenario(seed=0, duration=60.0):
+    return Scenario(np.random.default_rng(seed), duration)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_box_that_obeys_reaches_everything(seed):
+    story = scenario(seed)
+    act(story, obedient)
+    assert story.finished
+    names = [phase.name for phase in story.phases]
+    assert names == ["target 1", "target 2", "knock", "target 3", "drift", "rest"]
+    for phase in story.phases:
+        assert phase.start <= phase.end
+        if phase.name != "drift":
+            assert 0.0 <= phase.time_to_reach < phase.timeout
+    assert np.median(story.drift_distances) < 0.005
+
+
+def test_a_box_that_never_moves_reaches_nothing_and_time_runs_out():
+    story = scenario(duration=30.0)
+    history = act(story, lambda box, orders: box)
+    assert story.finished
+    assert history[-1][0] <= 30.0 + 6 * PERIOD
+    assert all(math.isnan(phase.reached) for phase in story.phases if phase.name.startswith("target"))
+
+
+def test_reached_means_within_10_mm_for_a_whole_second():
+    story = scenario()
+    goal = story.step(0.0, np.array([0.5, 0.0]), TOOL).goal
+    near, far = goal + [0.0099, 0.0], goal + [0.0101, 0.0]
+    for now in np.arange(1.0, 1.9, 0.1):
+        story.step(now, near, TOOL)
+    story.step(1.95, far, TOOL)
+    for now in np.arange(2.0, 2.95, 0.1):
+        story.step(now, near, TOOL)
+    assert math.isnan(story.phases[0].reached)
+    story.step(3.0, near, TOOL)
+    assert story.phases[0].reached == pytest.approx(2.0)
+
+
+def test_targets_are_in_the_area_and_a_jump_apart():
+    area = Area()
+    for seed in range(20):
+        story = scenario(seed)
+        history = act(story, obedient)
+        jumps = [0] + [i for i in range(1, len(history)) if np.linalg.norm(history[i][1].goal - history[i - 1][1].goal) > 0.02]
+        assert len(jumps) == 3
+        for index in jumps:
+            _, orders, box = history[index]
+            assert area.contains(orders.goal)
+            assert np.linalg.norm(orders.goal - box) >= 0.1
+
+
+def test_the_drift_has_its_speed_and_stays_in_the_area():
+    story = scenario(3, duration=200.0)
+    goals = np.array([orders.goal for _, orders, _ in act(story, obedient) if orders.goal_moves])
+    speeds = np.linalg.norm(np.diff(goals, axis=0), axis=1) / PERIOD
+    assert speeds == pytest.approx(DRIFT_SPEED, rel=1e-6)
+    assert all(story.area.contains(goal) for goal in goals)
+    assert np.any(np.diff(goals[:, 1]) > 0.0) and np.any(np.diff(goals[:, 1]) < 0.0)
+
+
+@pytest.mark.parametrize(("mass", "friction"), [(0.2, 0.2), (0.5, 0.35), (1.0, 0.6)])
+def test_the_hand_moves_any_box_by_about_the_distance_asked_for(mass, friction):
+    hand, distance = Knock(np.array([3.0, 4.0]), 0.07), 0.07
+    position, velocity, force, now = np.zeros(2), np.zeros(2), np.zeros(2), 0.0
+    while now < 5.0:
+        if round(now / 0.001) % 20 == 0:
+            force = hand.force(now, position)
+        speed = np.linalg.norm(velocity)
+        dry = friction * mass * 9.81
+        if speed > 1e-6:
+            resistance = -dry * velocity / speed
+        else:
+            resistance = -force * min(1.0, dry / max(np.linalg.norm(force), 1e-9))
+        new = velocity + 0.001 * (force + resistance) / mass
+        # Friction stops a box, it does not turn it round.
+        velocity = np.zeros(2) if speed > 0.0 and new @ velocity < 0.0 else new
+        position = position + 0.001 * velocity
+        now += 0.001
+    assert hand.done
+    assert 0.05 <= np.linalg.norm(position) <= 0.10
+    assert position / np.linalg.norm(position) == pytest.approx([0.6, 0.8], abs=1e-6)
+    assert distance == hand.distance
+
+
+def test_the_knock_leaves_the_box_among_the_targets_and_off_the_tool():
+    for seed in range(20):
+        history = act(scenario(seed), obedient)
+        boxes = np.array([box for _, orders, box in history if orders.force is not None])
+        moved = np.linalg.norm(boxes[-1] - boxes[0])
+        assert 0.05 <= moved <= 0.10
+        assert Area((0.42, 0.62), (-0.27, 0.27)).contains(boxes[-1])
+        assert np.linalg.norm(boxes - TOOL, axis=1).min() > 0.03

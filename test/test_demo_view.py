@@ -1,0 +1,84 @@
+import html
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim_bridge.report import video
+from sim_bridge.report.page import number, write_page
+from sim_bridge.report.view import Frame, ModelState, replay_page
+from sim_bridge.scene import Scene, build
+from vpsto_ros.robot.kinematics import fr3_pusher
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build(Scene())
+
+
+def test_a_frame_puts_robot_object_and_target_where_they_belong(model):
+    robot, state = fr3_pusher(), ModelState(model, fr3_pusher().joint_names)
+    joints = Scene().joints() + 0.1
+    state.pose(Frame(joints, np.array([0.5, 0.1, 0.7]), np.array([0.55, -0.1])))
+    assert state.data.site("tool_tip").xpos == pytest.approx(robot.forward(joints)[0], abs=1e-9)
+    assert state.data.body("object").xpos[:2] == pytest.approx([0.5, 0.1])
+    assert state.data.body("object").xquat == pytest.approx([np.cos(0.35), 0.0, 0.0, np.sin(0.35)])
+    assert state.data.body("goal").xpos[:2] == pytest.approx([0.55, -0.1])
+
+
+@pytest.mark.parametrize("target", [None, np.array([np.nan, np.nan])])
+def test_without_a_target_none_is_seen(model, target):
+    state = ModelState(model, fr3_pusher().joint_names)
+    state.pose(Frame(Scene().joints(), target=target))
+    assert state.data.body("goal").xpos[2] < -0.1
+
+
+def test_the_replay_is_one_page_that_loads_nothing(model):
+    joints = Scene().joints()
+    path = np.linspace([0.4, 0.0], [0.5, 0.1], 30)
+    frames = [Frame(joints + 0.01 * i, np.array([0.5, 0.01 * i, 0.0]), np.array([0.6, 0.0]), path) for i in range(5)]
+    page = replay_page(model, fr3_pusher().joint_names, frames, 20.0)
+    assert "__VISER_EMBED_DATA__" in page
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=\"(?!data:)", page)
+
+
+def test_a_report_embeds_pictures_and_replay_and_escapes_text(tmp_path):
+    picture = tmp_path / "chart.png"
+    picture.write_bytes(b"\x89PNG fake")
+    replay = '<html><script>var a = "b" < 3 && 1;</script></html>'
+    out = tmp_path / "report.html"
+    write_page(out, "Box & co", "3 < 4", True, [("Table", [["a", "b"], ["x", "<1>"]])], [(picture, "a chart")], replay)
+    text = out.read_text()
+    assert "Box &amp; co" in text and "3 &lt; 4" in text and "&lt;1&gt;" in text
+    assert 'src="data:image/png;base64,' in text
+    frame = re.search(r'srcdoc="([^"]*)"', text)
+    assert frame and html.unescape(frame.group(1)) == replay
+
+
+def test_numbers_for_people():
+    assert number(0.01234, 1e3, "mm", 1) == "12.3 mm"
+    assert number(float("nan"), 1.0, "s", 1) == "never"
+
+
+def test_a_machine_without_opengl_gets_advice_instead_of_a_video(tmp_path, monkeypatch):
+    class Pool:
+        def __init__(self, *_args, **_options):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return False
+
+        def submit(self, *_):
+            def result():
+                raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+
+            return SimpleNamespace(result=result)
+
+    monkeypatch.setattr(video.concurrent.futures, "ProcessPoolExecutor", Pool)
+    note = video.write_video(tmp_path / "video.mp4", Scene(), (), [], 20.0)
+    assert "apt install libegl1" in note and "eglQueryString" in note
+    assert not (tmp_path / "video.mp4").exists()

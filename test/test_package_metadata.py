@@ -1,0 +1,79 @@
+"""The package describes itself the same way everywhere, and its rooms import only what they may."""
+
+import ast
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+import vpsto_ros
+
+ROOT = Path(__file__).resolve().parents[1]
+SETUP = (ROOT / "setup.py").read_text()
+PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
+SCRIPTS = dict(re.findall(r'"(\w+) = ([\w.]+:\w+)"', SETUP))
+
+
+def test_versions_agree():
+    assert PACKAGE.findtext("version") == vpsto_ros.__version__
+    assert f'version="{vpsto_ros.__version__}"' in SETUP
+
+
+def test_colcon_can_read_the_package():
+    assert PACKAGE.findtext("name") == "vpsto_ros"
+    assert PACKAGE.findtext("license") == "Apache-2.0"
+    assert PACKAGE.findtext("export/build_type") == "ament_python"
+    address = PACKAGE.find("maintainer").get("email")
+    # Without a valid address colcon silently builds a plain Python package.
+    assert re.fullmatch(r"[-\w%+.]+@[-\w.]+\.[a-zA-Z]{2,}", address)
+    assert (ROOT / "resource" / "vpsto_ros").exists()
+
+
+def test_executables_go_where_ros2_run_looks():
+    text = (ROOT / "setup.cfg").read_text()
+    assert "script_dir=$base/lib/vpsto_ros" in text and "install_scripts=$base/lib/vpsto_ros" in text
+    assert set(SCRIPTS) == {"vpsto", "franka_driver", "state_estimator", "contact_planner", "mpc_planner"}
+
+
+@pytest.mark.parametrize("target", sorted(SCRIPTS.values()))
+def test_every_entry_point_exists(target):
+    module, function = target.split(":")
+    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text())
+    assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_every_message_package_that_is_imported_is_declared():
+    declared = {element.text for element in PACKAGE.findall("exec_depend")}
+    imported = set()
+    for file in [*ROOT.glob("vpsto_ros/**/*.py"), *ROOT.glob("sim_bridge/**/*.py"), *ROOT.glob("launch/*.py")]:
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
+            imported |= {name.split(".")[0] for name in names}
+    ros = {name for name in imported if name.endswith(("_msgs", "_srvs", "_interfaces")) or name in ("rclpy", "launch", "launch_ros")}
+    assert ros <= declared
+
+
+def modules(room):
+    for file in sorted((ROOT / room).glob("**/*.py")):
+        name = ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        if not name.startswith("vpsto_ros.nodes"):
+            yield name
+
+
+def test_the_library_needs_neither_ros_nor_a_simulator():
+    code = f"import importlib, sys\nfor name in {list(modules('vpsto_ros'))!r}: importlib.import_module(name)\nprint(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    assert "vpsto_ros.trajectory" in loaded
+    tops = {name.split(".")[0] for name in loaded}
+    assert tops.isdisjoint({"rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags"})
+
+
+def test_models_are_installed_with_the_package():
+    files = [file.relative_to(ROOT) for file in ROOT.glob("vpsto_ros/**/*.xml")]
+    assert files
+    assert {str(file.parent) for file in files} == {"vpsto_ros/robot/models"}
+    assert '"vpsto_ros.robot": ["models/*.xml"]' in SETUP
