@@ -19,7 +19,9 @@ class CameraConfig:
     rate: float = option(50.0, "frames per second", unit="Hz", minimum=0.1, maximum=1000.0)
     latency: float = option(0.04, "from exposure to the result", unit="s", minimum=0.0, maximum=2.0)
     position_std: float = option(0.002, "standard deviation of x and y", unit="m", minimum=0.0, maximum=1.0)
-    yaw_std: float = option(0.017453292519943295, "standard deviation of the yaw", unit="rad", minimum=0.0, maximum=3.0)
+    yaw_std: float = option(
+        0.017453292519943295, "standard deviation of the yaw", unit="rad", minimum=0.0, maximum=3.0
+    )
     dropout: float = option(0.05, "share of frames without a result", minimum=0.0, maximum=1.0)
 
     def __post_init__(self) -> None:
@@ -76,7 +78,8 @@ class Camera:
             raise InvalidInputError(f"pose must be (x, y, yaw), got shape {pose.shape}")
         missed = int((t + _ROUNDING - self._start) * self.config.rate) + 1
         self._index = max(self._index + 1, missed)
-        # Noise and drop-outs are drawn for every picture, so that runs which differ in one of them stay comparable.
+        # Noise and drop-outs are drawn for every picture, so that runs which differ in one of them stay
+        # comparable.
         noise, lost = self._rng.standard_normal(3), self._rng.random() < self.config.dropout
         if not lost:
             measured = pose + self._stds * noise

@@ -16,9 +16,10 @@ from vpsto_ros.robot.kinematics import Robot
 class ImpedanceConfig:
     """Gains of the impedance controller.
 
-    The stiffness lies between what FR3 controllers use in compliant tasks and the arm's own joint impedance; a push of 6 N at the
-    tip then costs at most 3 mm on the table. Joint 7 turns a round rod about its axis and has next to no inertia: soft, so that its
-    natural frequency stays far below the control rate.
+    The stiffness lies between what FR3 controllers use in compliant tasks and the arm's own joint
+    impedance; a push of 6 N at the tip then costs at most 3 mm on the table. Joint 7 turns a round rod
+    about its axis and has next to no inertia: soft, so that its natural frequency stays far below the
+    control rate.
     """
 
     stiffness: tuple[float, ...] = option(
@@ -33,19 +34,26 @@ class ImpedanceConfig:
 
 
 class ImpedanceController:
-    """u = C(q, qd) qd + g(q) + M(q) qdd_des - K (q - q_des) - D (qd - qd_des), within torque and torque-rate limits.
+    """Stiffness control in joint space, within torque and torque-rate limits.
 
-    Eq. (2.5). One recursive Newton-Euler pass gives the first three terms. The damping matrix is designed once, at a nominal posture,
-    such that every mode of M and K has the wanted damping ratio there (double diagonalization).
+    Eq. (2.5): u = C(q, qd) qd + g(q) + M(q) qdd_des - K (q - q_des) - D (qd - qd_des). One recursive
+    Newton-Euler pass gives the first three terms. The damping matrix is designed once, at a nominal
+    posture, such that every mode of M and K has the wanted damping ratio there (double diagonalization).
 
     Attributes:
         saturated: control cycles in which each joint's torque was cut to its limit, shape (7,).
         rate_limited: likewise for the torque rate, shape (7,).
-        demand: what the last cycle asked for before it was cut, as shares of the torque and torque-rate limits, shape (2, 7).
+        demand: what the last cycle asked for before it was cut, as shares of the torque and torque-rate
+            limits, shape (2, 7).
     """
 
     def __init__(
-        self, robot: Robot, nominal_posture: ArrayLike, config: ImpedanceConfig | None = None, *, period: float = 0.001
+        self,
+        robot: Robot,
+        nominal_posture: ArrayLike,
+        config: ImpedanceConfig | None = None,
+        *,
+        period: float = 0.001,
     ):
         """Design the gains.
 
@@ -63,7 +71,9 @@ class ImpedanceController:
         config = config or ImpedanceConfig()
         self._robot = robot
         self._stiffness = np.array(config.stiffness)
-        self._damping = critical_damping(robot.mass_matrix(nominal_posture), self._stiffness, config.damping_ratio)
+        self._damping = critical_damping(
+            robot.mass_matrix(nominal_posture), self._stiffness, config.damping_ratio
+        )
         self._limit = np.array(robot.torque_limits)
         self._step = np.array(robot.torque_rate_limits) * period
         self._torque = np.zeros(7)
@@ -99,8 +109,8 @@ class ImpedanceController:
         """
         model_torque = self._robot.inverse_dynamics(q, qd, qdd_des)
         _control_law(
-            model_torque, q, qd, q_des, qd_des, self._stiffness, self._damping, self._limit, self._step, self._fresh,
-            self._torque, self._counts, self.demand,
+            model_torque, q, qd, q_des, qd_des, self._stiffness, self._damping, self._limit, self._step,
+            self._fresh, self._torque, self._counts, self.demand,
         )  # fmt: skip
         self._fresh = False
         return self._torque

@@ -21,7 +21,8 @@ class LimitReport:
 
     Attributes:
         instants: instants at which some joint was beyond its limit.
-        worst: largest share of the limit over joints and instants; 1 is the limit. For positions the range counts from its middle.
+        worst: largest share of the limit over joints and instants; 1 is the limit. For positions the range
+            counts from its middle.
         joint: joint of the worst share, from 1; 0 if nothing was seen yet.
     """
 
@@ -33,7 +34,8 @@ class LimitReport:
 class LimitMonitor:
     """Reference, measured motion and torques against the limits of the arm, at every control cycle.
 
-    Torques and torque rates are counted as asked for: the controller cuts them, so that a count says how often it had to.
+    Torques and torque rates are counted as asked for: the controller cuts them, so that a count says how
+    often it had to.
     """
 
     def __init__(self, limits: Limits):
@@ -55,8 +57,11 @@ class LimitMonitor:
         """Take in one control cycle.
 
         Args:
-            q_des: reference position [rad], shape (7,); likewise qd_des [rad/s] and qdd_des [rad/s²].
-            q: measured position [rad], shape (7,); likewise qd [rad/s].
+            q_des: reference position [rad], shape (7,).
+            qd_des: reference velocity [rad/s], shape (7,).
+            qdd_des: reference acceleration [rad/s²], shape (7,).
+            q: measured position [rad], shape (7,).
+            qd: measured velocity [rad/s], shape (7,).
             demand: shares of the torque and torque-rate limits asked for, shape (2, 7).
         """
         self.instants += 1

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.looks import add_looks
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.contact.geometry import Disc, PlanarShape, Rectangle
 from vpsto_ros.exceptions import ConfigurationError
@@ -19,13 +20,13 @@ from vpsto_ros.robot.kinematics import MODEL_PATH, TOOL_LENGTH, fr3_pusher
 TIMESTEP = 0.001
 TOOL_RADIUS = 0.015
 
-# Friction and damping of the real joints that is left after the maker's compensation; no controller here knows them.
+# Friction and damping of the real joints that is left after the maker's compensation; no controller here
+# knows them.
 _JOINT_FRICTION = (0.3, 0.3, 0.3, 0.3, 0.15, 0.1, 0.1)  # [Nm]
 _JOINT_DAMPING = (0.5, 0.5, 0.5, 0.5, 0.2, 0.1, 0.005)  # [Nm s/rad]
 
 _FOOT_RADIUS = 0.004
 _ROBOT, _ROD = 1, 4  # collision bits; the object only meets what asks for it by an explicit pair or by these
-_TABLE_COLOUR = (0.86, 0.81, 0.74, 1.0)
 _OBJECT_COLOUR = (0.93, 0.58, 0.16, 1.0)
 _GOAL_COLOUR = (0.16, 0.66, 0.36, 0.45)
 
@@ -63,14 +64,16 @@ class ObjectPlant:
         com = self.shape.centroid() + self.com_offset
         if not _inside_hull(self.feet(), com):
             raise ConfigurationError(
-                f"ObjectPlant.com_offset = {self.com_offset} puts the centre of mass beyond the feet; the object would tip over"
+                f"ObjectPlant.com_offset = {self.com_offset} puts the centre of mass beyond the feet; the "
+                "object would tip over"
             )
 
     def feet(self) -> NDArray[np.float64]:
         """Where the object touches the table, shape (F, 2) [m], object frame.
 
-        Corners: the corners of the outline (four points on the rim of a disc). Spread: the centre of each primitive and four
-        points around it, such that equal loads have the second moments of an evenly spread pressure.
+        Corners: the corners of the outline (four points on the rim of a disc). Spread: the centre of each
+        primitive and four points around it, such that equal loads have the second moments of an evenly
+        spread pressure.
         """
         points = [foot for p in self.shape.primitives for foot in _primitive_feet(p, self.support)]
         feet = np.array(points)
@@ -104,9 +107,13 @@ class Scene:
     start_tool: tuple[float, float] = option(
         (0.38, -0.22), "start of the rod on the table", unit="m", minimum=-1.0, maximum=1.0
     )
-    tool_height: float = option(0.02, "height of the rod's tip above the table", unit="m", minimum=0.002, maximum=0.2)
+    tool_height: float = option(
+        0.02, "height of the rod's tip above the table", unit="m", minimum=0.002, maximum=0.2
+    )
     joint_friction: float = option(1.0, "scale of the dry friction of the joints", minimum=0.0, maximum=10.0)
-    joint_damping: float = option(1.0, "scale of the viscous friction of the joints", minimum=0.0, maximum=10.0)
+    joint_damping: float = option(
+        1.0, "scale of the viscous friction of the joints", minimum=0.0, maximum=10.0
+    )
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -116,7 +123,8 @@ class Scene:
         """Joint positions at the start [rad], shape (7,).
 
         Raises:
-            ConfigurationError: start_joints has not seven entries within the limits, or start_tool is out of reach.
+            ConfigurationError: start_joints has not seven entries within the limits, or start_tool is out
+                of reach.
         """
         robot = fr3_pusher()
         if self.start_joints is None:
@@ -124,20 +132,23 @@ class Scene:
             if not table.contains(self.start_tool):
                 low, high = table.radius_range
                 raise ConfigurationError(
-                    f"Scene.start_tool = {self.start_tool} is out of reach; its distance from the base must be "
-                    f"{low:.2f} to {high:.2f} m"
+                    f"Scene.start_tool = {self.start_tool} is out of reach; its distance from the base must "
+                    f"be {low:.2f} to {high:.2f} m"
                 )
             return table.joints([self.start_tool])[0]
         q = np.array(self.start_joints, dtype=float)
         if q.shape != (7,) or not np.all((q >= robot.limits.lower) & (q <= robot.limits.upper)):
-            raise ConfigurationError(f"Scene.start_joints = {self.start_joints} must be 7 angles within the joint limits")
+            raise ConfigurationError(
+                f"Scene.start_joints = {self.start_joints} must be 7 angles within the joint limits"
+            )
         return q
 
 
 def build(scene: Scene) -> mujoco.MjModel:
     """Compile the scene for MuJoCo.
 
-    Names: joints ``fr3_joint1..7`` and ``object``, bodies ``object`` and ``goal`` (a see-through marker), cameras ``overview``,
+    Names: joints ``fr3_joint1..7`` and ``object``, bodies ``object`` and ``goal`` (a see-through marker),
+        cameras ``overview``,
     ``top`` and ``side``, site ``tool_tip``.
     """
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
@@ -147,14 +158,15 @@ def build(scene: Scene) -> mujoco.MjModel:
     _add_table(spec)
     _add_object(spec, scene)
     _add_goal(spec, scene.plant)
-    _add_looks(spec)
+    add_looks(spec)
     return spec.compile()
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The elliptic cone has isotropic friction; impratio > 1 makes friction stiffer than the normal, against creep.
+    # The elliptic cone has isotropic friction; impratio > 1 makes friction stiffer than the normal, against
+    # creep.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.iterations = 20
@@ -186,8 +198,7 @@ def _prepare_robot(spec: mujoco.MjSpec, scene: Scene) -> None:
 
 
 def _add_table(spec: mujoco.MjSpec) -> None:
-    world = spec.worldbody
-    world.add_geom(
+    spec.worldbody.add_geom(
         name="table",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[2, 2, 0.1],
@@ -195,11 +206,6 @@ def _add_table(spec: mujoco.MjSpec) -> None:
         contype=0,
         conaffinity=_ROBOT | _ROD,
     )
-    spec.add_material(name="table", rgba=_TABLE_COLOUR, specular=0.15, shininess=0.2)
-    _decorate(world, [0.42, 0.0, -0.0205], [0.72, 0.75, 0.02], material="table")
-    for x in (-0.24, 1.08):
-        for y in (-0.69, 0.69):
-            _decorate(world, [x, y, -0.395], [0.03, 0.03, 0.355], rgba=(0.35, 0.36, 0.38, 1.0))
 
 
 def _add_object(spec: mujoco.MjSpec, scene: Scene) -> None:
@@ -212,7 +218,8 @@ def _add_object(spec: mujoco.MjSpec, scene: Scene) -> None:
     body.explicitinertial = True
     body.mass = plant.mass
     body.ipos = np.array([*(plant.shape.centroid() + plant.com_offset), plant.height / 2])
-    # Evenly filled about the vertical axis; how the moment splits between the level axes matters only for tipping.
+    # Evenly filled about the vertical axis; how the moment splits between the level axes matters only for
+    # tipping.
     turn = plant.mass * plant.shape.polar_radius**2
     tip = turn / 2 + plant.mass * plant.height**2 / 12
     body.inertia = np.array([tip, tip, turn])
@@ -224,16 +231,22 @@ def _add_object(spec: mujoco.MjSpec, scene: Scene) -> None:
         _add_pair(spec, "rod", f"object{i}", plant.tool_friction, time_constant=0.01)
     for i, (fx, fy) in enumerate(plant.feet()):
         body.add_geom(
-            name=f"foot{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[fx, fy, _FOOT_RADIUS], size=[_FOOT_RADIUS, 0, 0],
-            group=3, contype=0, conaffinity=0,
-        )  # fmt: skip
+            name=f"foot{i}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=[fx, fy, _FOOT_RADIUS],
+            size=[_FOOT_RADIUS, 0, 0],
+            group=3,
+            contype=0,
+            conaffinity=0,
+        )
         _add_pair(spec, "table", f"foot{i}", plant.table_friction, time_constant=0.01)
 
 
 def _add_pair(spec: mujoco.MjSpec, first: str, second: str, friction: float, *, time_constant: float) -> None:
     """A contact with exactly this friction coefficient; without any friction, one of a single direction.
 
-    The time constant is the softness: 10 ms for the rod is a thin coat of rubber (at 0.35 m/s it dents by 0.5 mm).
+    The time constant is the softness: 10 ms for the rod is a thin coat of rubber (at 0.35 m/s it dents by
+    0.5 mm).
     """
     spec.add_pair(
         geomname1=first,
@@ -250,12 +263,20 @@ def _add_goal(spec: mujoco.MjSpec, plant: ObjectPlant) -> None:
     goal = spec.worldbody.add_body(name="goal", mocap=True, pos=[0.5, 0.0, -0.5])
     for kind, pos, size, quat in _solids(plant.shape, 0.002):
         goal.add_geom(
-            type=kind, pos=pos, size=size, quat=quat, rgba=_GOAL_COLOUR, group=1, contype=0, conaffinity=0, mass=0.0
+            type=kind,
+            pos=pos,
+            size=size,
+            quat=quat,
+            rgba=_GOAL_COLOUR,
+            group=1,
+            contype=0,
+            conaffinity=0,
+            mass=0.0,
         )
 
 
 def _solids(shape: PlanarShape, height: float):
-    """Type, position, size and quaternion of one geom per primitive, standing on the plane z = 0 of the object frame."""
+    """Type, position, size and quaternion of one geom per primitive, standing on the object frame's z = 0."""
     for p in shape.primitives:
         pos = [*p.center, height / 2]
         if isinstance(p, Disc):
@@ -265,57 +286,13 @@ def _solids(shape: PlanarShape, height: float):
             yield mujoco.mjtGeom.mjGEOM_BOX, pos, [*p.half_size, height / 2], turn
 
 
-def _add_looks(spec: mujoco.MjSpec) -> None:
-    # Large shadow maps and multisampling cut the frame rate of software rendering to a tenth.
-    visual = spec.visual
-    visual.quality.shadowsize = 1024
-    visual.quality.offsamples = 0
-    getattr(visual, "global").offwidth = 1920
-    getattr(visual, "global").offheight = 1080
-    visual.headlight.ambient = [0.34, 0.34, 0.36]
-    visual.headlight.diffuse = [0.16, 0.16, 0.16]
-    visual.headlight.specular = [0.1, 0.1, 0.1]
-    spec.stat.center = [0.4, 0.0, 0.25]
-    spec.stat.extent = 1.2
-    spec.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.93, 0.95, 0.97], rgb2=[0.62, 0.68, 0.75], width=256, height=256,
-    )  # fmt: skip
-    world = spec.worldbody
-    for pos, direction, strength in (([0.9, -0.9, 1.9], [-0.5, 0.6, -1.0], 0.48), ([-0.3, 1.2, 1.6], [0.7, -0.9, -0.8], 0.22)):
-        world.add_light(
-            pos=pos, dir=direction, diffuse=[strength] * 3, specular=[0.12] * 3, castshadow=False,
-            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        )  # fmt: skip
-    _decorate(world, [0.42, 0.0, -0.77], [4.0, 4.0, 0.01], rgba=(0.72, 0.75, 0.78, 1.0))
-    _add_camera(world, "overview", eye=(1.50, -1.00, 0.95), target=(0.34, 0.0, 0.24), fovy=40.0)
-    _add_camera(world, "side", eye=(0.45, -1.75, 0.45), target=(0.35, 0.0, 0.30), fovy=38.0)
-    world.add_camera(name="top", pos=[0.45, 0.0, 1.75], quat=[math.sqrt(0.5), 0, 0, -math.sqrt(0.5)], fovy=40.0)
-
-
-def _add_camera(world, name: str, eye, target, fovy: float) -> None:
-    backward = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right)
-    frame = np.column_stack([right, np.cross(backward, right), backward])
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, frame.ravel())
-    world.add_camera(name=name, pos=eye, quat=quat, fovy=fovy)
-
-
-def _decorate(body, pos, size, **looks) -> None:
-    """A box that is only seen."""
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, pos=pos, size=size, group=2, contype=0, conaffinity=0, mass=0.0, **looks
-    )
-
-
 def _primitive_feet(primitive: Rectangle | Disc, support: str) -> NDArray[np.float64]:
     """Feet under one primitive, in the object frame; see :meth:`ObjectPlant.feet`."""
     signs = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     if isinstance(primitive, Disc):
         half, angle = np.full(2, primitive.radius * math.sqrt(0.5)), 0.0
-        share = math.sqrt(5.0 / 8.0)  # 4/5 of the load at this share of the radius: the second moment of a disc, r²/2
+        # Four fifths of the load at this share of the radius: the second moment of a disc, r²/2.
+        share = math.sqrt(5.0 / 8.0)
     else:
         half, angle = np.array(primitive.half_size), primitive.angle
         share = math.sqrt(5.0 / 12.0)  # likewise for a rectangle: half²/3 along each axis
@@ -330,7 +307,7 @@ def _first_of_each(points: NDArray) -> list[int]:
 
 
 def _inside_hull(points: NDArray, query: NDArray) -> bool:
-    """Whether a point is strictly inside the convex hull of others: seen from it, no gap between them spans 180 degrees."""
+    """Whether a point is inside the hull of others: seen from it, no gap between them spans 180 degrees."""
     angles = np.sort(np.arctan2(points[:, 1] - query[1], points[:, 0] - query[0]))
     gaps = np.diff(np.append(angles, angles[0] + 2.0 * np.pi))
     return bool(gaps.max() < np.pi - 1e-3)

@@ -1,6 +1,7 @@
-"""The simulated robot, table and object at 1 kHz: what a planner meets instead of a real Franka. Free of ROS and of wall clocks.
+"""The simulated robot, table and object at 1 kHz, free of ROS and of wall clocks.
 
-Per step: the reference of the trajectory follower, the impedance controller, MuJoCo, and a camera that watches the object.
+Per step: the reference of the trajectory follower, the impedance controller, MuJoCo, and a camera that
+watches the object.
 """
 
 from dataclasses import dataclass
@@ -117,7 +118,8 @@ class Simulation:
     def step(self) -> None:
         """Advance by one millisecond."""
         model, data, now = self.model, self.data, self._steps * TIMESTEP
-        # Forward quantities belong to the state before mj_step; splitting it gives the controller the present ones.
+        # Forward quantities belong to the state before mj_step; splitting it gives the controller the
+        # present ones.
         mujoco.mj_step1(model, data)
         q_des, qd_des, qdd_des = self.follower.reference(now)
         controller = self.controller
@@ -172,7 +174,7 @@ class Simulation:
         return np.array([x, y, np.arctan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))])
 
     def object_twist(self) -> NDArray[np.float64]:
-        """True velocity of the object's frame (vx, vy, yaw rate) [m/s, rad/s] in the base frame, shape (3,)."""
+        """True velocity of the object's frame, (vx, vy, yaw rate) [m/s, rad/s] in the base frame."""
         return self._object_qd[[0, 1, 5]]
 
     def camera_frames(self) -> list[CameraFrame]:
@@ -193,7 +195,12 @@ class Simulation:
         return total
 
     def push_object(self, force: ArrayLike, torque: ArrayLike, duration: float) -> None:
-        """Push the object at its centre of mass with a constant force [N] and torque [Nm], base frame, for a duration [s].
+        """Push the object at its centre of mass with a constant wrench.
+
+        Args:
+            force: (3,) [N], base frame.
+            torque: (3,) [Nm], base frame.
+            duration: how long, from now [s].
 
         Raises:
             InvalidInputError: force or torque is not three finite numbers, or the duration is not positive.
@@ -204,15 +211,17 @@ class Simulation:
     def knock(self, displacement: ArrayLike, duration: float = 0.25) -> None:
         """Let a hand move the object by about displacement (2,) [m] within a duration [s].
 
-        The hand holds the object at its centre of mass, along a smooth path, without turning it on purpose, and gives way above a
-        force limit, so that it does not push through the rod.
+        The hand holds the object at its centre of mass, along a smooth path, without turning it on purpose,
+        and gives way above a force limit, so that it does not push through the rod.
 
         Raises:
             InvalidInputError: the displacement is not two finite numbers, or the duration is not positive.
         """
         origin = self._object_center()
         self._disturbances.append(
-            _Hand(self.time, _positive(duration, "duration"), origin, _vector(displacement, "displacement", 2))
+            _Hand(
+                self.time, _positive(duration, "duration"), origin, _vector(displacement, "displacement", 2)
+            )
         )
 
     def show_goal(self, pose: ArrayLike | None) -> None:
@@ -225,7 +234,9 @@ class Simulation:
         self.data.mocap_quat[self._marker] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
 
     def reset(self, object_pose: ArrayLike | None = None, joints: ArrayLike | None = None) -> None:
-        """Put object and arm back, at rest, holding. Time goes on: subscribers and filters never see it jump back.
+        """Put object and arm back, at rest, holding.
+
+        Time goes on, so that subscribers and filters never see it jump back.
 
         Args:
             object_pose: (x, y, yaw) [m, rad]; that of the scene if None.

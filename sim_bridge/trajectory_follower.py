@@ -1,9 +1,10 @@
 """Follows joint trajectories by the rules of a stock joint_trajectory_controller, without ROS.
 
-The rules are those of ros2_controllers' validation with its defaults (no partial goals, no velocity at the end, no integration),
-and its interpolation: linear without velocities, cubic with them, quintic where two neighbouring points also have accelerations.
-Stricter on purpose, because a real arm's safety layer would stop it: limits must hold at every instant and the reference must not
-jump. Milder in one place: until a trajectory's first point the running one goes on if it leads there.
+The rules are those of ros2_controllers' validation with its defaults (no partial goals, no velocity at the
+end, no integration), and its interpolation: linear without velocities, cubic with them, quintic where two
+neighbouring points also have accelerations. Stricter on purpose, because a real arm's safety layer would
+stop it: limits must hold at every instant and the reference must not jump. Milder in one place: until a
+trajectory's first point the running one goes on if it leads there.
 """
 
 from collections.abc import Sequence
@@ -44,7 +45,8 @@ class TrajectoryRejected(InvalidInputError):
     """A command broke a rule; the reference goes on as before.
 
     Attributes:
-        rule: which one, a short word: joint_names, empty, shape, finite, time, past, future, end_velocity, limits or jump.
+        rule: which one, a short word: joint_names, empty, shape, finite, time, past, future, end_velocity,
+            limits or jump.
         message: what was expected, what came, and what to do.
     """
 
@@ -59,11 +61,18 @@ class TrajectoryRejected(InvalidInputError):
 class FollowerConfig:
     """Tolerances of the rules."""
 
-    position_jump: float = option(2e-3, "largest step of the reference position", unit="rad", minimum=0.0, maximum=0.1)
-    velocity_jump: float = option(2e-2, "largest step of the reference velocity", unit="rad/s", minimum=0.0, maximum=1.0)
+    position_jump: float = option(
+        2e-3, "largest step of the reference position", unit="rad", minimum=0.0, maximum=0.1
+    )
+    velocity_jump: float = option(
+        2e-2, "largest step of the reference velocity", unit="rad/s", minimum=0.0, maximum=1.0
+    )
     horizon: float = option(10.0, "how far ahead a stamp may be", unit="s", minimum=0.0, maximum=1e4)
     limit_tolerance: float = option(
-        1e-4, "share by which limits may be exceeded: messages round times to nanoseconds", minimum=0.0, maximum=0.1
+        1e-4,
+        "share by which limits may be exceeded: messages round times to nanoseconds",
+        minimum=0.0,
+        maximum=0.1,
     )
 
     def __post_init__(self) -> None:
@@ -78,7 +87,11 @@ class TrajectoryFollower:
     """
 
     def __init__(
-        self, limits: Limits, joint_names: Sequence[str], start: ArrayLike, config: FollowerConfig | None = None
+        self,
+        limits: Limits,
+        joint_names: Sequence[str],
+        start: ArrayLike,
+        config: FollowerConfig | None = None,
     ):
         """Hold the position `start` (n,) [rad] until a trajectory comes.
 
@@ -90,7 +103,8 @@ class TrajectoryFollower:
         self.config = config or FollowerConfig()
         if not len(self._names) == limits.dof == np.size(start):
             raise InvalidInputError(
-                f"{len(self._names)} joint names, {limits.dof} limits and {np.size(start)} positions do not fit together"
+                f"{len(self._names)} joint names, {limits.dof} limits and {np.size(start)} positions do not "
+                "fit together"
             )
         self.hold(start, 0.0)
 
@@ -112,7 +126,7 @@ class TrajectoryFollower:
         self._set_schedule([(t, Trajectory.from_points([t, t + 1.0], rows, np.zeros_like(rows)))])
 
     def stop(self, t: float) -> Trajectory:
-        """Brake from the reference at time t [s] to rest with the limits' deceleration, and hold; the safe stop."""
+        """Brake to rest from the reference at time t [s], as hard as the limits allow, and hold."""
         q, qd, _ = self.reference(t)
         if np.abs(qd).max() > 0.0:
             self._set_schedule([(t, braking_trajectory(q, qd, self._limits, start_time=t))])
@@ -140,7 +154,7 @@ class TrajectoryFollower:
         self._set_schedule(kept + schedule)
 
     def _points(self, command: TrajectoryCommand):
-        """Times, positions, velocities (or None) and accelerations (or None) in the controller's order of joints."""
+        """Times, positions, velocities and accelerations (or None), in the controller's order of joints."""
         order = self._joint_order(command.joint_names)
         times = _array(command.time_from_start, "time_from_start")
         if times.ndim != 1 or times.size == 0:
@@ -157,9 +171,13 @@ class TrajectoryFollower:
                 raise TrajectoryRejected(
                     "shape", f"{name} must have one value per point and joint, {shape}, got {array.shape}"
                 )
-            missing = np.isnan(array).all(axis=1) if name == "accelerations" else np.zeros(len(array), dtype=bool)
+            missing = (
+                np.isnan(array).all(axis=1) if name == "accelerations" else np.zeros(len(array), dtype=bool)
+            )
             if not np.isfinite(array[~missing]).all():
-                raise TrajectoryRejected("finite", f"{name} must be finite numbers; check the planner for NaN or inf")
+                raise TrajectoryRejected(
+                    "finite", f"{name} must be finite numbers; check the planner for NaN or inf"
+                )
             columns.append(array[:, order])
         return times, *columns
 
@@ -174,10 +192,13 @@ class TrajectoryFollower:
         missing = [name for name in self._names if name not in names]
         if missing:
             raise TrajectoryRejected(
-                "joint_names", f"partial trajectories are not taken; '{missing[0]}' is missing; name all of {expected}"
+                "joint_names",
+                f"partial trajectories are not taken; '{missing[0]}' is missing; name all of {expected}",
             )
         if len(names) != len(self._names):
-            raise TrajectoryRejected("joint_names", f"a joint is named twice in {', '.join(names)}; name each once")
+            raise TrajectoryRejected(
+                "joint_names", f"a joint is named twice in {', '.join(names)}; name each once"
+            )
         return [names.index(name) for name in self._names]
 
     def _start_time(self, command: TrajectoryCommand, offsets: NDArray, now: float) -> float:
@@ -186,20 +207,22 @@ class TrajectoryFollower:
         if offsets[0] < 0.0 or np.any(np.diff(offsets) <= 0.0):
             i = 0 if offsets[0] < 0.0 else int(np.flatnonzero(np.diff(offsets) <= 0.0)[0])
             raise TrajectoryRejected(
-                "time", f"time_from_start must be >= 0 and increase strictly; see point {i} at {offsets[i]:.9g} s and the next"
+                "time",
+                f"time_from_start must be >= 0 and increase strictly; see point {i} at {offsets[i]:.9g} s "
+                "and the next",
             )
         start = command.stamp if command.stamp != 0.0 else now
         if start + offsets[-1] < now:
             raise TrajectoryRejected(
                 "past",
-                f"it ended at {start + offsets[-1]:.3f} s and now is {now:.3f} s; stamp it with the time of planning, or with zero "
-                "to start now, and check that both sides use the same clock",
+                f"it ended at {start + offsets[-1]:.3f} s and now is {now:.3f} s; stamp it with the time of "
+                "planning, or with zero to start now, and check that both sides use the same clock",
             )
         if start > now + self.config.horizon:
             raise TrajectoryRejected(
                 "future",
-                f"its stamp {start:.3f} s is more than {self.config.horizon:g} s after now, {now:.3f} s; check that both sides use "
-                "the same clock (use_sim_time)",
+                f"its stamp {start:.3f} s is more than {self.config.horizon:g} s after now, {now:.3f} s; "
+                "check that both sides use the same clock (use_sim_time)",
             )
         return start
 
@@ -209,8 +232,8 @@ class TrajectoryFollower:
             j = int(np.abs(velocities[-1]).argmax())
             raise TrajectoryRejected(
                 "end_velocity",
-                f"the last point must be at rest, {self._names[j]} still moves at {velocities[-1, j]:.3g} rad/s; let every "
-                "trajectory end in a stop",
+                f"the last point must be at rest, {self._names[j]} still moves at {velocities[-1, j]:.3g} "
+                "rad/s; let every trajectory end in a stop",
             )
         if velocities is None:
             accelerations = None  # as in the stock controller: nothing can be made of accelerations alone
@@ -222,42 +245,47 @@ class TrajectoryFollower:
             new = Trajectory.from_points(times, positions, velocities, accelerations)
         except InvalidInputError as error:
             raise TrajectoryRejected("time", f"{error}; points may be too close in time") from error
-        self._check_knots(new, linear=velocities is None)
+        if velocities is None:
+            self._check_corners(new)
         return new
 
-    def _check_knots(self, new: Trajectory, *, linear: bool) -> None:
-        """No step in velocity at a point; only linear interpolation makes any, between its points and at its end."""
-        if not linear:
-            return
+    def _check_corners(self, new: Trajectory) -> None:
+        """Straight lines between points must not step in velocity, neither at a point nor at the end."""
         jump = np.maximum(new.jumps()[1], np.abs(new.knots()[1][-1]))
         if jump.max() > self.config.velocity_jump:
             raise TrajectoryRejected(
                 "jump",
-                f"without velocities points are joined by straight lines, which step by {jump.max():.3g} rad/s in velocity "
-                f"(allowed: {self.config.velocity_jump:g}); send velocities too",
+                f"without velocities points are joined by straight lines, which step by {jump.max():.3g} "
+                f"rad/s in velocity (allowed: {self.config.velocity_jump:g}); send velocities too",
             )
 
     def _lead_in(self, new: Trajectory, now: float) -> list[tuple[float, Trajectory]]:
-        """What to follow until the first point of a trajectory that begins later, and then that trajectory."""
+        """What to follow until the first point of a trajectory that begins later, and that trajectory."""
         first = new.start_time
         q, qd, _ = self._at(first)
         q_new, qd_new, _ = new.state(first)
-        if self._jump(q, q_new, self.config.position_jump) <= 1.0 and self._jump(qd, qd_new, self.config.velocity_jump) <= 1.0:
+        if (
+            self._jump(q, q_new, self.config.position_jump) <= 1.0
+            and self._jump(qd, qd_new, self.config.velocity_jump) <= 1.0
+        ):
             return [(first, new)]
         q, qd, _ = self._at(now)
         bridge = Trajectory.from_points([now, first], [q, q_new], [qd, qd_new])
         return [(now, bridge), (first, new)]
 
     def _check_join(self, running, new, now: float) -> None:
-        names = (("position", "rad", self.config.position_jump), ("velocity", "rad/s", self.config.velocity_jump))
+        names = (
+            ("position", "rad", self.config.position_jump),
+            ("velocity", "rad/s", self.config.velocity_jump),
+        )
         for (name, unit, allowed), before, after in zip(names, running, new, strict=False):
             if self._jump(before, after, allowed) > 1.0:
                 j = int(np.abs(after - before).argmax())
                 raise TrajectoryRejected(
                     "jump",
-                    f"at {now:.3f} s, where it takes over, the {name} of {self._names[j]} would step from {before[j]:.5g} to "
-                    f"{after[j]:.5g} {unit} (allowed: {allowed:g}); continue the trajectory that runs, or let the first point lie "
-                    "in the future",
+                    f"at {now:.3f} s, where it takes over, the {name} of {self._names[j]} would step from "
+                    f"{before[j]:.5g} to {after[j]:.5g} {unit} (allowed: {allowed:g}); continue the "
+                    "trajectory that runs, or let the first point lie in the future",
                 )
 
     @staticmethod
@@ -270,7 +298,8 @@ class TrajectoryFollower:
         broken = part.violations(self._limits, self.config.limit_tolerance)
         if broken:
             raise TrajectoryRejected(
-                "limits", f"limits must hold at every instant, also between points: {'; '.join(broken)}; slow it down"
+                "limits",
+                f"limits must hold at every instant, also between points: {'; '.join(broken)}; slow it down",
             )
 
     def _at(self, t: float):
@@ -290,4 +319,6 @@ def _array(values: ArrayLike, name: str) -> NDArray[np.float64]:
     try:
         return np.array(values, dtype=float)
     except (TypeError, ValueError) as error:
-        raise TrajectoryRejected("shape", f"{name} must be a table of numbers with equally long rows") from error
+        raise TrajectoryRejected(
+            "shape", f"{name} must be a table of numbers with equally long rows"
+        ) from error

@@ -27,7 +27,9 @@ def plane_points(table, count, seed=0, margin=0.0):
 def test_tip_is_at_the_point_at_the_height_and_upright(table):
     points = plane_points(table, 200)
     q = table.joints(points)
-    np.testing.assert_allclose(forward_kinematics_batch(q), np.column_stack([points, np.full(200, 0.02)]), atol=1e-12)
+    np.testing.assert_allclose(
+        forward_kinematics_batch(q), np.column_stack([points, np.full(200, 0.02)]), atol=1e-12
+    )
     for posture in q[::10]:
         np.testing.assert_allclose(fr3_pusher().forward(posture)[1][:, 2], [0, 0, -1], atol=1e-12)
 

@@ -75,7 +75,9 @@ def test_mujoco_and_pinocchio_read_the_same_arm(postures, simulated):
         mujoco.mj_fullM(model, data, inertia)
         np.testing.assert_allclose(data.site("tool_tip").xpos, robot.forward(q)[0], atol=1e-9)
         np.testing.assert_allclose(robot.mass_matrix(q), inertia, atol=1e-9)
-        np.testing.assert_allclose(robot.inverse_dynamics(q, qd, qdd), inertia @ qdd + data.qfrc_bias, atol=1e-9)
+        np.testing.assert_allclose(
+            robot.inverse_dynamics(q, qd, qdd), inertia @ qdd + data.qfrc_bias, atol=1e-9
+        )
         data.qvel[:] = 0.0
         mujoco.mj_forward(model, data)
         np.testing.assert_allclose(robot.gravity(q), data.qfrc_bias, atol=1e-9)
@@ -91,7 +93,9 @@ def test_tip_velocity_is_jacobian_times_joint_velocity(postures):
 def test_tip_velocity_is_the_derivative_of_the_position(postures):
     rates = np.random.default_rng(4).normal(size=postures.shape)
     step = 1e-6
-    difference = forward_kinematics_batch(postures + step * rates) - forward_kinematics_batch(postures - step * rates)
+    difference = forward_kinematics_batch(postures + step * rates) - forward_kinematics_batch(
+        postures - step * rates
+    )
     np.testing.assert_allclose(tip_velocity_batch(postures, rates), difference / (2 * step), atol=1e-8)
 
 
@@ -99,7 +103,9 @@ def test_limits_are_those_of_the_fr3():
     robot = fr3_pusher()
     assert robot.joint_names == JOINT_NAMES
     np.testing.assert_allclose(robot.limits.upper, [2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159])
-    np.testing.assert_allclose(robot.limits.lower, [-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159])
+    np.testing.assert_allclose(
+        robot.limits.lower, [-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159]
+    )
     np.testing.assert_allclose(robot.limits.velocity, [2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])
     np.testing.assert_allclose(robot.limits.acceleration, 10.0)
     np.testing.assert_allclose(robot.torque_limits, [87, 87, 87, 87, 12, 12, 12])
@@ -107,7 +113,7 @@ def test_limits_are_those_of_the_fr3():
 
 
 def test_gravity_is_the_gradient_of_the_potential_energy(postures, simulated):
-    """Independent of both dynamics libraries' recursions: heights of the centres of mass, differentiated numerically."""
+    """Independent of both libraries' recursions: heights of the centres of mass, differentiated."""
     model, data = simulated
 
     def energy(q):
@@ -134,7 +140,7 @@ def test_misuse_is_named():
         fr3_pusher().forward(np.zeros(6))
     with pytest.raises(ConfigurationError, match="no robot description"):
         Robot.from_mjcf("nowhere.xml")
-    with pytest.raises(ConfigurationError, match="no frame 'hand'.*tool_tip"):
+    with pytest.raises(ConfigurationError, match=r"no frame 'hand'.*tool_tip"):
         Robot.from_mjcf(MODEL_PATH, tip="hand")
     with pytest.raises(ConfigurationError, match="velocity must be 7 positive"):
         Robot.from_mjcf(MODEL_PATH, velocity=[1.0] * 6)
@@ -143,7 +149,12 @@ def test_misuse_is_named():
 def test_ordinary_postures_do_not_collide(simulated):
     model, data = simulated
     ready = [0, -math.pi / 4, 0, -3 * math.pi / 4, 0, math.pi / 2, math.pi / 4]
-    for q in (ready, [0, 0.3, 0, -2.3, 0, 2.6, 0.8], [1.0, -0.5, 0.5, -2.0, -0.6, 2.0, 0], [0, 0, 0, -0.2, 0, 1.8, 0]):
+    for q in (
+        ready,
+        [0, 0.3, 0, -2.3, 0, 2.6, 0.8],
+        [1.0, -0.5, 0.5, -2.0, -0.6, 2.0, 0],
+        [0, 0, 0, -0.2, 0, 1.8, 0],
+    ):
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
         assert data.ncon == 0, q

@@ -1,104 +1,27 @@
 """Inverse kinematics: the tool plane in closed form, and damped least squares for any pose of the tip.
 
-On the table the rod stands upright with its tip at a fixed height and the elbow stays in the vertical plane through the base
-axis (q3 = q5 = 0). What is left is a planar arm with two links: joint positions are then exact, smooth functions of the tip's
-position (x, y), and so are their derivatives. Planners can search in the plane and hand out joint trajectories.
+On the table the rod stands upright with its tip at a fixed height and the elbow stays in the vertical plane
+through the base axis (q3 = q5 = 0). What is left is a planar arm with two links: joint positions are then
+exact, smooth functions of the tip's position (x, y), and so are their derivatives. Planners can search in
+the plane and hand out joint trajectories.
 """
 
-from typing import NamedTuple
-
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.robot import kinematics as fr3
 from vpsto_ros.robot.kinematics import Robot, forward_kinematics_batch, tip_velocity_batch
+from vpsto_ros.robot.radial_arm import (
+    FOREARM,
+    STRAIGHT_ELBOW,
+    UPPER_ARM,
+    RadialArm,
+    plane_to_joints,
+    radial_arms,
+)
 
-# Link lengths of the planar arm: shoulder to elbow joint, elbow joint to wrist; the elbow is offset from both link axes.
-_UPPER = float(np.hypot(fr3.UPPER_ARM, fr3.ELBOW_OFFSET))
-_FORE = float(np.hypot(fr3.FOREARM, fr3.ELBOW_OFFSET))
-_UPPER_TILT = float(np.arctan2(fr3.ELBOW_OFFSET, fr3.UPPER_ARM))
-_FORE_TILT = float(np.arctan2(fr3.ELBOW_OFFSET, fr3.FOREARM))
 _STRETCH_MARGIN = 0.3  # the elbow stays bent by at least this beyond the straight, singular arm [rad]
-
-
-class RadialArm(NamedTuple):
-    """Joints 2, 4 and 6 as functions of the tip's radius: values and derivatives, each of shape (K, 3)."""
-
-    angle: NDArray[np.float64]
-    first: NDArray[np.float64]
-    second: NDArray[np.float64]
-
-
-@njit(cache=True, nogil=True)
-def _radial_arm(radius, wrist_height, out):
-    """Fill out (3 orders, 3 joints) for one radius; returns False out of reach.
-
-    Two-link arm with the tilts t1, t2 of the links against the vertical: rho = A sin t1 + B sin t2, h = A cos t1 + B cos t2.
-    """
-    A, B = _UPPER, _FORE
-    rho = radius - fr3.WRIST_OFFSET
-    cos_bend = (rho * rho + wrist_height * wrist_height - A * A - B * B) / (2.0 * A * B)
-    if not -1.0 < cos_bend < 1.0:
-        return False
-    bend = np.arccos(cos_bend)
-    sin_bend = np.sin(bend)
-    t1 = np.arctan2(rho, wrist_height) - np.arctan2(B * sin_bend, A + B * cos_bend)
-    t2 = t1 + bend
-    s1, c1, s2, c2 = np.sin(t1), np.cos(t1), np.sin(t2), np.cos(t2)
-    # First derivatives solve the two constraints differentiated by the radius; the second ones differentiate those again.
-    d1 = s2 / (A * sin_bend)
-    d2 = -s1 / (B * sin_bend)
-    shrink = cos_bend * (d2 - d1) / sin_bend
-    dd1 = c2 * d2 / (A * sin_bend) - d1 * shrink
-    dd2 = -c1 * d1 / (B * sin_bend) - d2 * shrink
-    out[0, 0], out[1, 0], out[2, 0] = t1 - _UPPER_TILT, d1, dd1
-    out[0, 1], out[1, 1], out[2, 1] = -(bend + _UPPER_TILT + _FORE_TILT), d1 - d2, dd1 - dd2
-    out[0, 2], out[1, 2], out[2, 2] = t2 + _FORE_TILT, d2, dd2
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _radial_arms(radii, wrist_height):
-    out = np.empty((radii.shape[0], 3, 3))
-    for k in range(radii.shape[0]):
-        if not _radial_arm(radii[k], wrist_height, out[k]):
-            return out, k
-    return out, -1
-
-
-@njit(cache=True, nogil=True)
-def _plane_to_joints(points, velocities, accelerations, wrist_height, q7, orders):
-    """Joint positions, velocities and accelerations of a motion in the plane; orders of them are filled.
-
-    Returns the arrays and the index of the first point out of reach (-1: none).
-    """
-    count = points.shape[0]
-    q, qd, qdd = np.zeros((count, 7)), np.zeros((count, 7)), np.zeros((count, 7))
-    arm = np.empty((3, 3))
-    for k in range(count):
-        x, y = points[k, 0], points[k, 1]
-        r = np.sqrt(x * x + y * y)
-        if not _radial_arm(r, wrist_height, arm):
-            return q, qd, qdd, k
-        q[k, 0], q[k, 6] = np.arctan2(y, x), q7
-        q[k, 1], q[k, 3], q[k, 5] = arm[0, 0], arm[0, 1], arm[0, 2]
-        if orders < 2:
-            continue
-        vr = (x * velocities[k, 0] + y * velocities[k, 1]) / r
-        w = (x * velocities[k, 1] - y * velocities[k, 0]) / (r * r)
-        qd[k, 0] = w
-        for j in range(3):
-            qd[k, 2 * j + 1] = arm[1, j] * vr
-        if orders < 3:
-            continue
-        ar = (x * accelerations[k, 0] + y * accelerations[k, 1]) / r + r * w * w
-        at = (x * accelerations[k, 1] - y * accelerations[k, 0]) / r
-        qdd[k, 0] = (at - 2.0 * vr * w) / r
-        for j in range(3):
-            qdd[k, 2 * j + 1] = arm[1, j] * ar + arm[2, j] * vr * vr
-    return q, qd, qdd, -1
 
 
 class TableMap:
@@ -106,15 +29,18 @@ class TableMap:
 
     Attributes:
         height: height of the tip above the table [m].
-        radius_range: (r_min, r_max) [m], distances of the tip from the base axis for which the joint position limits hold and
-            the elbow stays clear of the singular, straight arm.
+        radius_range: (r_min, r_max) [m], distances of the tip from the base axis for which the joint
+            position limits hold and the elbow stays clear of the singular, straight arm.
     """
 
-    def __init__(self, robot: Robot, height: float = 0.02, *, tool_yaw: float = np.pi / 4, margin: float = 0.02):
+    def __init__(
+        self, robot: Robot, height: float = 0.02, *, tool_yaw: float = np.pi / 4, margin: float = 0.02
+    ):
         """Fix the plane.
 
         Args:
-            robot: the arm; its position, velocity and acceleration limits are used. It must have the FR3's geometry.
+            robot: the arm; its position, velocity and acceleration limits are used. It must have the FR3's
+                geometry.
             height: height of the tip above the table [m].
             tool_yaw: constant position of joint 7 [rad]; the rod is round, so that any value does.
             margin: distance kept from the joint position limits [rad].
@@ -129,20 +55,24 @@ class TableMap:
         self.radius_range = self._find_radius_range(margin)
         probe = np.array([0.5 * sum(self.radius_range), 0.0])
         if np.abs(robot.forward(self.joints(probe[None])[0])[0] - [*probe, self.height]).max() > 1e-9:
-            raise InvalidInputError("TableMap knows the geometry of the FR3 with the pushing rod only; this robot differs")
+            raise InvalidInputError(
+                "TableMap knows the geometry of the FR3 with the pushing rod only; this robot differs"
+            )
 
     def _find_radius_range(self, margin: float) -> tuple[float, float]:
         limits = self._robot.limits
-        radii = np.linspace(fr3.WRIST_OFFSET + 1e-3, fr3.WRIST_OFFSET + _UPPER + _FORE, 7201)
+        radii = np.linspace(fr3.WRIST_OFFSET + 1e-3, fr3.WRIST_OFFSET + UPPER_ARM + FOREARM, 7201)
         reach = np.hypot(radii - fr3.WRIST_OFFSET, self._wrist_height)
-        radii = radii[(reach < _UPPER + _FORE - 1e-6) & (reach > abs(_FORE - _UPPER) + 1e-6)]
+        radii = radii[(reach < UPPER_ARM + FOREARM - 1e-6) & (reach > abs(FOREARM - UPPER_ARM) + 1e-6)]
         angles = self.radial(radii).angle
         index = [1, 3, 5]
         inside = (angles >= limits.lower[index] + margin) & (angles <= limits.upper[index] - margin)
-        bent = -angles[:, 1] - _UPPER_TILT - _FORE_TILT > _STRETCH_MARGIN
+        bent = angles[:, 1] < STRAIGHT_ELBOW - _STRETCH_MARGIN
         good = np.flatnonzero(inside.all(axis=1) & bent)
         if len(good) == 0 or not limits.lower[6] <= self._tool_yaw <= limits.upper[6]:
-            raise InvalidInputError(f"no posture within the joint limits holds the upright tool at height {self.height} m")
+            raise InvalidInputError(
+                f"no posture within the joint limits holds the upright tool at height {self.height} m"
+            )
         return float(radii[good[0]]), float(radii[good[-1]])
 
     def radial(self, radii: ArrayLike) -> RadialArm:
@@ -152,13 +82,13 @@ class TableMap:
             InfeasibleError: a radius is out of reach.
         """
         radii = np.ascontiguousarray(radii, dtype=float)
-        out, bad = _radial_arms(radii, self._wrist_height)
+        out, bad = radial_arms(radii, self._wrist_height)
         if bad >= 0:
             raise InfeasibleError(self._reach_message(radii[bad]))
         return RadialArm(out[:, 0], out[:, 1], out[:, 2])
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Whether plane points (..., 2) [m] lie in the annulus of radius_range, at least margin [m] from its rims."""
+        """Whether plane points (..., 2) [m] lie in radius_range, at least margin [m] from its ends."""
         radii = np.linalg.norm(np.asarray(points, dtype=float), axis=-1)
         return (radii >= self.radius_range[0] + margin) & (radii <= self.radius_range[1] - margin)
 
@@ -190,7 +120,7 @@ class TableMap:
         return self._motion(*rows, 3)
 
     def joint_velocity(self, point: ArrayLike, velocity: ArrayLike) -> NDArray[np.float64]:
-        """Joint velocities (7,) or (K, 7) [rad/s] of a tip at point (2,) or (K, 2) [m] moving with velocity [m/s]."""
+        """Joint velocities (7,) or (K, 7) [rad/s] of a tip at point (2,) or (K, 2) [m] with a velocity."""
         single = np.ndim(point) == 1
         rows, rates = _rows(np.atleast_2d(point), "point"), _rows(np.atleast_2d(velocity), "velocity")
         qd = self._motion(rows, rates, rates, 2)[1]
@@ -203,7 +133,7 @@ class TableMap:
         return np.stack(columns, axis=-1)
 
     def tool(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Plane points (..., 2) [m] of the tip for joint positions (..., 7) [rad], whether or not these are upright."""
+        """Plane points (..., 2) [m] of the tip for joint positions (..., 7) [rad], upright or not."""
         q = np.asarray(q, dtype=float)
         return forward_kinematics_batch(q.reshape(-1, 7))[:, :2].reshape(*q.shape[:-1], 2)
 
@@ -216,11 +146,12 @@ class TableMap:
     def plane_limits(
         self, r_min: float, r_max: float, speed: float = 0.35, *, margin: float = 0.02
     ) -> tuple[float, float]:
-        """Speed and acceleration per axis that every motion inside an annulus may use without breaking a joint limit.
+        """Speed and acceleration per axis with which no motion inside an annulus breaks a joint limit.
 
-        With |v_x|, |v_y| <= v the tip's speed is at most sqrt(2) v in any direction, and likewise for the acceleration. Per
-        radius the largest joint accelerations over all directions are then sums of maxima: joint 1 carries the tangential
-        acceleration and the Coriolis term, |2 v_r v_t| <= 2 v²; the others f' (a_r + v_t²/r) + f'' v_r².
+        With |v_x|, |v_y| <= v the tip's speed is at most sqrt(2) v in any direction, and likewise for the
+        acceleration. Per radius the largest joint accelerations over all directions are then sums of
+        maxima: joint 1 carries the tangential acceleration and the Coriolis term, |2 v_r v_t| <= 2 v²; the
+        others f' (a_r + v_t²/r) + f'' v_r².
 
         Args:
             r_min: inner radius [m].
@@ -237,7 +168,9 @@ class TableMap:
         """
         low, high = self.radius_range
         if not low <= r_min < r_max <= high:
-            raise InvalidInputError(f"need {low:.3f} <= r_min < r_max <= {high:.3f} m, got {r_min} and {r_max}")
+            raise InvalidInputError(
+                f"need {low:.3f} <= r_min < r_max <= {high:.3f} m, got {r_min} and {r_max}"
+            )
         r = np.linspace(r_min, r_max, 2001)
         _, first, second = self.radial(r)
         slopes = np.column_stack([1.0 / r, np.abs(first)])  # joints 1, 2, 4, 6 per metre
@@ -248,13 +181,15 @@ class TableMap:
         v = float(min(speed, (rate / (np.sqrt(2.0) * slopes)).min()))
         a = float(((force - 2.0 * v * v * bends) / (np.sqrt(2.0) * slopes)).min())
         if a <= 0.0:
-            raise InfeasibleError(f"{v:.2f} m/s per axis uses up the joint accelerations on {r_min}-{r_max} m; lower the speed")
+            raise InfeasibleError(
+                f"{v:.2f} m/s per axis uses up the joint accelerations on {r_min}-{r_max} m; lower the speed"
+            )
         return v, a
 
     def _motion(self, points, velocities, accelerations, orders):
         if not points.shape == velocities.shape == accelerations.shape:
             raise InvalidInputError("points, velocities and accelerations must have equal shapes")
-        q, qd, qdd, bad = _plane_to_joints(
+        q, qd, qdd, bad = plane_to_joints(
             points, velocities, accelerations, self._wrist_height, self._tool_yaw, orders
         )
         if bad >= 0:
@@ -264,7 +199,9 @@ class TableMap:
     def _reach_message(self, radius: float) -> str:
         usable = getattr(self, "radius_range", None)
         hint = f"; usable radii: {usable[0]:.3f} to {usable[1]:.3f} m" if usable else ""
-        return f"the upright tool cannot reach {radius:.3f} m from the base axis at height {self.height} m{hint}"
+        return (
+            f"the upright tool cannot reach {radius:.3f} m from the base axis at height {self.height} m{hint}"
+        )
 
 
 def _rows(values: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -285,8 +222,9 @@ def solve(
 ) -> NDArray[np.float64]:
     """Joint positions for a pose of the tip by damped least squares, within the joint position limits.
 
-    The damping falls with the error and rises when a step did not help, so that steps are short near singular postures and
-    Newton's elsewhere. Every iterate is clipped to the limits. It is a local method: other seeds may succeed where one fails.
+    The damping falls with the error and rises when a step did not help, so that steps are short near
+    singular postures and Newton's elsewhere. Every iterate is clipped to the limits. It is a local method:
+    other seeds may succeed where one fails.
 
     Args:
         robot: the arm.
@@ -302,7 +240,9 @@ def solve(
     """
     position, q = np.asarray(position, dtype=float), np.array(q_seed, dtype=float)
     if position.shape != (3,) or q.shape != (robot.dof,):
-        raise InvalidInputError(f"need position (3,) and q_seed ({robot.dof},), got {position.shape} and {q.shape}")
+        raise InvalidInputError(
+            f"need position (3,) and q_seed ({robot.dof},), got {position.shape} and {q.shape}"
+        )
     if rotation is not None and np.shape(rotation) != (3, 3):
         raise InvalidInputError(f"rotation must have shape (3, 3), got {np.shape(rotation)}")
     q = np.clip(q, robot.limits.lower, robot.limits.upper)
@@ -321,13 +261,15 @@ def solve(
             boost *= 10.0
     where = np.array2string(position, precision=3)
     raise InfeasibleError(
-        f"no posture within the joint limits reaches the tip pose at {where} m: an error of {np.abs(error).max():.2g} is left; "
-        "try another seed"
+        f"no posture within the joint limits reaches the tip pose at {where} m: an error of "
+        f"{np.abs(error).max():.2g} is left; try another seed"
     )
 
 
-def _pose_error(robot: Robot, q: NDArray, position: NDArray, rotation: ArrayLike | None) -> NDArray[np.float64]:
-    """Position error and, if an orientation is asked for, the rotation vector that remains; axes of the base."""
+def _pose_error(
+    robot: Robot, q: NDArray, position: NDArray, rotation: ArrayLike | None
+) -> NDArray[np.float64]:
+    """Position error and, if an orientation is given, the rotation vector that remains; axes of the base."""
     reached, frame = robot.forward(q)
     if rotation is None:
         return position - reached

@@ -1,7 +1,8 @@
-"""The Franka Research 3 with a pushing rod: limits, dynamics through Pinocchio, and fast batched kinematics of its own.
+"""The Franka Research 3 with a pushing rod: limits, dynamics by Pinocchio, own fast kinematics.
 
-One robot description (``models/fr3_pusher.xml``) is read by Pinocchio here and by the simulator elsewhere. What the planners
-call thousands of times per replan, the position of the tool tip, is compiled here from the modified DH table instead.
+One robot description (``models/fr3_pusher.xml``) is read by Pinocchio here and by the simulator elsewhere.
+What the planners call thousands of times per replan, the position of the tool tip, is compiled here from
+the modified DH table instead.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ from vpsto_ros.trajectory.timing import Limits
 MODEL_PATH = Path(__file__).parent / "models" / "fr3_pusher.xml"
 JOINT_NAMES = tuple(f"fr3_joint{i}" for i in range(1, 8))
 
-# Limits of the FR3 that its MJCF cannot hold (Pinocchio leaves the velocity limit of an MJCF infinite) [rad/s, rad/s², Nm/s].
+# Limits of the FR3 that its MJCF cannot hold (Pinocchio leaves the velocity limit of an MJCF infinite)
+# [rad/s, rad/s², Nm/s].
 VELOCITY_LIMITS = (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26)
 ACCELERATION_LIMITS = (10.0,) * 7
 TORQUE_RATE_LIMITS = (1000.0,) * 7
@@ -31,7 +33,8 @@ WRIST_OFFSET = 0.088
 FLANGE_OFFSET = 0.107
 TOOL_LENGTH = 0.16  # from the flange to the tip of the rod
 
-# Modified DH rows (a, d, cos alpha, sin alpha); alpha is a multiple of 90 degrees, so its sine and cosine are exact.
+# Modified DH rows (a, d, cos alpha, sin alpha); alpha is a multiple of 90 degrees, so its sine and cosine
+# are exact.
 _DH = np.array(
     [
         (0.0, SHOULDER_HEIGHT, 1.0, 0.0),
@@ -50,8 +53,8 @@ _TIP = FLANGE_OFFSET + TOOL_LENGTH
 def _tip_motion(dh, tip, q, qd, position, velocity):
     """Positions and, if the array is not empty, velocities of the tips, shapes (B, 3).
 
-    The tip is handed from frame to frame, from the flange down to the base, which needs no rotation matrices. It lies on the
-    axis of joint 7, so that this joint moves nothing.
+    The tip is handed from frame to frame, from the flange down to the base, which needs no rotation
+    matrices. It lies on the axis of joint 7, so that this joint moves nothing.
     """
     moving = velocity.shape[0] > 0
     for b in range(q.shape[0]):
@@ -113,7 +116,9 @@ def tip_velocity_batch(q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
     """
     rows, rates = _joint_rows(q, "q"), _joint_rows(qd, "qd")
     if len(rows) != len(rates):
-        raise InvalidInputError(f"q and qd must have as many rows as each other, got {len(rows)} and {len(rates)}")
+        raise InvalidInputError(
+            f"q and qd must have as many rows as each other, got {len(rows)} and {len(rates)}"
+        )
     position, velocity = np.empty((len(rows), 3)), np.empty((len(rows), 3))
     _tip_motion(_DH, _TIP, rows, rates, position, velocity)
     return velocity
@@ -122,7 +127,8 @@ def tip_velocity_batch(q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
 class Robot:
     """A serial arm read from an MJCF file: kinematics and dynamics of its tool tip through Pinocchio.
 
-    Not thread-safe: the Pinocchio workspace is shared by the methods of one instance. The compiled functions of this module are.
+    Not thread-safe: the Pinocchio workspace is shared by the methods of one instance. The compiled
+    functions of this module are.
 
     Attributes:
         joint_names: names of the joints, in the order of q.
@@ -131,7 +137,9 @@ class Robot:
         torque_rate_limits: largest rates of the joint torques [Nm/s], shape (n,).
     """
 
-    def __init__(self, model, *, velocity: ArrayLike, acceleration: ArrayLike, torque_rate: ArrayLike, tip: str):
+    def __init__(
+        self, model, *, velocity: ArrayLike, acceleration: ArrayLike, torque_rate: ArrayLike, tip: str
+    ):
         """Wrap a Pinocchio model; see :meth:`from_mjcf`."""
         import pinocchio
 
@@ -139,7 +147,9 @@ class Robot:
         self._model = model
         self._data = model.createData()
         if not model.existFrame(tip):
-            raise ConfigurationError(f"the robot description has no frame '{tip}'; it has: {_frame_names(model)}")
+            raise ConfigurationError(
+                f"the robot description has no frame '{tip}'; it has: {_frame_names(model)}"
+            )
         self._tip = model.getFrameId(tip)
         self.joint_names: tuple[str, ...] = tuple(list(model.names)[1:])
         self.torque_limits = _per_joint(model.effortLimit, model.nv, "effort limits")
@@ -164,8 +174,8 @@ class Robot:
         """Read a robot description.
 
         Args:
-            path: MJCF file. Everything that belongs to the robot must be inside its first top-level body, and that body must be
-                at the origin: Pinocchio reads no other and drops its offset.
+            path: MJCF file. Everything that belongs to the robot must be inside its first top-level body,
+                and that body must be at the origin: Pinocchio reads no other and drops its offset.
             velocity: velocity limits [rad/s], one per joint (an MJCF holds none).
             acceleration: acceleration limits [rad/s²], one per joint.
             torque_rate: limits of the torque rates [Nm/s], one per joint.
@@ -193,14 +203,15 @@ class Robot:
         return placement.translation.copy(), placement.rotation.copy()
 
     def jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Jacobian (6, n) of the tool tip at q (n,) [rad]: rows 0-2 linear, 3-5 angular velocity, along the axes of the base."""
+        """Jacobian (6, n) of the tool tip at q (n,) [rad]: linear, then angular, in axes of the base."""
         frame = self._pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         return self._pin.computeFrameJacobian(self._model, self._data, self._vector(q, "q"), self._tip, frame)
 
     def inverse_dynamics(self, q: NDArray, qd: NDArray, qdd: NDArray) -> NDArray[np.float64]:
         """Torques M(q) qdd + C(q, qd) qd + g(q) [Nm], shape (n,); eq. (2.1) without external forces.
 
-        One recursive Newton-Euler pass; called every control cycle, so that its arguments go to Pinocchio unchecked.
+        One recursive Newton-Euler pass; called every control cycle, so that its arguments go to Pinocchio
+        unchecked.
         """
         return self._pin.rnea(self._model, self._data, q, qd, qdd)
 
@@ -233,5 +244,5 @@ def _frame_names(model) -> str:
 
 @lru_cache(maxsize=1)
 def fr3_pusher() -> Robot:
-    """The Franka Research 3 with the pushing rod, read once and shared (see the note on threads at :class:`Robot`)."""
+    """The Franka Research 3 with the pushing rod, read once and shared (but not by threads)."""
     return Robot.from_mjcf(MODEL_PATH)
