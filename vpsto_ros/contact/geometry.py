@@ -1,7 +1,7 @@
 """Planar shapes: unions of rectangles and discs, their outline, area integrals and distances.
 
-Lengths in metres, angles in radians. A shape lives in its own object frame; the frame's origin is the point whose world position
-an object pose (x, y, yaw) gives.
+Lengths in metres, angles in radians. A shape lives in its own object frame; the frame's origin is the point
+whose world position an object pose (x, y, yaw) gives.
 """
 
 import math
@@ -94,7 +94,7 @@ class PlanarShape:
     def tee(
         cls, bar_length: float = 0.12, bar_width: float = 0.04, stem_length: float | None = None
     ) -> "PlanarShape":
-        """T of two bars, the stem pointing to -y from below the middle of the bar; origin at the centre of area.
+        """T of two bars with the stem towards -y; origin at the centre of area.
 
         Args:
             bar_length: length of the bar along x [m].
@@ -108,10 +108,12 @@ class PlanarShape:
 
     @classmethod
     def ell(cls, length: float = 0.12, width: float = 0.04, height: float | None = None) -> "PlanarShape":
-        """L of two bars of equal width; outer edges `length` along x and `height` along y; origin at the centre of area."""
+        """L of two bars with outer edges `length` along x, `height` along y; origin at the centre of area."""
         height = length if height is None else height
         if min(length, height) <= width:
-            raise InvalidInputError(f"an L needs length and height above its width {width}, got {length}, {height}")
+            raise InvalidInputError(
+                f"an L needs length and height above its width {width}, got {length}, {height}"
+            )
         upright = Rectangle((width / 2, height / 2), (width / 2, height / 2))
         foot = Rectangle(((length + width) / 2, width / 2), ((length - width) / 2, width / 2))
         return cls((upright, foot)).recentred()
@@ -122,7 +124,9 @@ class PlanarShape:
         moved = []
         for p in self.primitives:
             center = (p.center[0] - x, p.center[1] - y)
-            moved.append(Disc(center, p.radius) if isinstance(p, Disc) else Rectangle(center, p.half_size, p.angle))
+            moved.append(
+                Disc(center, p.radius) if isinstance(p, Disc) else Rectangle(center, p.half_size, p.angle)
+            )
         return PlanarShape(tuple(moved))
 
     def as_array(self) -> np.ndarray:
@@ -131,7 +135,7 @@ class PlanarShape:
 
     @cached_property
     def kernel_rows(self) -> np.ndarray:
-        """Primitives as the compiled kernels take them, rows (cx, cy, hx, hy, cos, sin, radius), shape (P, 7)."""
+        """Primitives as compiled kernels take them: (cx, cy, hx, hy, cos, sin, radius), shape (P, 7)."""
         rows = self.as_array()
         packed = np.column_stack([rows[:, :4], np.cos(rows[:, 4]), np.sin(rows[:, 4]), rows[:, 5]])
         return np.ascontiguousarray(packed)
@@ -156,7 +160,7 @@ class PlanarShape:
 
     @cached_property
     def polar_radius(self) -> float:
-        """Polar radius of gyration about the centre of area [m]: the square root of the second moment per area."""
+        """Polar radius of gyration about the centre of area [m]: root of the second moment per area."""
         second = self._integrate(lambda x, low, high: x**2 * (high - low) + (high**3 - low**3) / 3)
         return math.sqrt(second / self.area() - float(np.sum(self.centroid() ** 2)))
 
@@ -170,7 +174,7 @@ class PlanarShape:
         return max(reach)
 
     def mean_distance(self, point=(0.0, 0.0)) -> float:
-        """Mean distance of the area to a point of the object frame [m]: the torque arm of evenly spread friction."""
+        """Mean distance [m] of the area to a point of the object frame: the arm of evenly spread friction."""
         px, py = _checked("point", point, (2,))
 
         def antiderivative(x, y):
@@ -183,7 +187,7 @@ class PlanarShape:
         return total / self.area()
 
     def _integrate(self, column) -> float:
-        """Integral of a function over the union, from its exact integrals `column(x, low, high)` over vertical lines."""
+        """Integral over the union, from the integrals `column(x, low, high)` over vertical lines."""
         nodes, weights = self._scan_lines
         total = 0.0
         for x, weight, intervals in zip(nodes, weights, self._scan_intervals, strict=True):
@@ -208,7 +212,10 @@ class PlanarShape:
     def _scan_intervals(self) -> list[list[tuple[float, float]]]:
         """For every scan line, the disjoint intervals of y inside the union."""
         rows = self.as_array()
-        return [outline.merge([span for row in rows if (span := outline.column(row, x))]) for x in self._scan_lines[0]]
+        return [
+            outline.merge([span for row in rows if (span := outline.column(row, x))])
+            for x in self._scan_lines[0]
+        ]
 
     def boundary(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Evenly spaced points on the outline of the union, in running order; inner edges are left out.
@@ -244,7 +251,8 @@ class PlanarShape:
             points: object frame [m], shape (K, 2).
 
         Returns:
-            distances [m], shape (K,); inside unions with discs, arcs are taken as polygons (error below 1e-4 of the radius).
+            distances [m], shape (K,); inside unions with discs, arcs are taken as polygons (error below 1e-4
+            of the radius).
         """
         points = np.ascontiguousarray(_checked("points", points, (None, 2)))
         distances = np.empty(len(points))
@@ -252,10 +260,13 @@ class PlanarShape:
         return distances
 
     def transform(self, pose: np.ndarray) -> list[np.ndarray]:
-        """World polygons for drawing, one per primitive: corners counter-clockwise, shape (V, 2); discs have 64 corners.
+        """World polygons for drawing, one per primitive.
 
         Args:
             pose: object pose (x, y, yaw).
+
+        Returns:
+            corners counter-clockwise, shape (V, 2) each; discs have 64.
         """
         x, y, yaw = _checked("pose", pose, (3,))
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
@@ -265,7 +276,9 @@ class PlanarShape:
 def _checked(name: str, value, shape: tuple[int | None, ...]) -> np.ndarray:
     """The value as a finite float array of the given shape."""
     array = np.asarray(value, dtype=float)
-    fits = array.ndim == len(shape) and all(want in (None, has) for want, has in zip(shape, array.shape, strict=True))
+    fits = array.ndim == len(shape) and all(
+        want in (None, has) for want, has in zip(shape, array.shape, strict=True)
+    )
     if not fits or not np.all(np.isfinite(array)):
         raise InvalidInputError(f"{name} must be finite with shape {shape}, got shape {array.shape}: {array}")
     return array

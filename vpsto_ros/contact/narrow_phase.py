@@ -1,14 +1,18 @@
 """Compiled narrow phase: where a tool touches, or is about to touch, a union of rectangles and discs.
 
-Everything here is expressed in the object frame. A primitive is one row ``(cx, cy, hx, hy, cos, sin, r)``: a rectangle with half
-sizes ``hx, hy`` turned by the angle whose cosine and sine are given (``r = 0``), or a disc of radius ``r`` (``hx = hy = 0``). The
-tool is one primitive ``(hx, hy, r)`` with its own pose. A contact is one row whose first columns are ``GAP`` (negative when
-penetrating), the unit normal ``NX, NY`` pointing out of the object, and the contact point ``PX, PY`` on the object.
+Everything here is expressed in the object frame. A primitive is one row ``(cx, cy, hx, hy, cos, sin, r)``: a
+rectangle with half sizes ``hx, hy`` turned by the angle whose cosine and sine are given (``r = 0``), or a
+disc of radius ``r`` (``hx = hy = 0``). The tool is one primitive ``(hx, hy, r)`` with its own pose. A contact
+is one row whose first columns are ``GAP`` (negative when penetrating), the unit normal ``NX, NY`` pointing
+out of the object, and the contact point ``PX, PY`` on the object.
 """
 
 import math
 
 from numba import njit
+
+# Fused multiply-adds and reciprocals are welcome; NaN and infinity keep their meaning.
+COMPILED = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
 
 GAP, NX, NY, PX, PY = 0, 1, 2, 3, 4
 
@@ -20,7 +24,7 @@ PROBE = 1e-6
 PARALLEL_BIAS = 1e-9
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(**COMPILED, inline="always")
 def _nearest(lx, ly, hx, hy, r):
     """Gap, outward normal and surface point of a primitive, seen from a point in the primitive's frame."""
     qx = abs(lx) - hx
@@ -30,8 +34,8 @@ def _nearest(lx, ly, hx, hy, r):
         ey = qy if qy > 0.0 else 0.0
         d = math.sqrt(ex * ex + ey * ey)
         if d > 1e-12:
-            nx = math.copysign(ex, lx) / d
-            ny = math.copysign(ey, ly) / d
+            nx = math.copysign(ex / d, lx)
+            ny = math.copysign(ey / d, ly)
             sx = min(max(lx, -hx), hx) + r * nx
             sy = min(max(ly, -hy), hy) + r * ny
             return d - r, nx, ny, sx, sy
@@ -42,7 +46,7 @@ def _nearest(lx, ly, hx, hy, r):
     return qy - r, 0.0, ny, lx, ny * (hy + r)
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def primitive_distance(primitives, j, x, y):
     """Signed distance from the point (x, y) to primitive j."""
     dx = x - primitives[j, 0]
@@ -52,7 +56,7 @@ def primitive_distance(primitives, j, x, y):
     return _nearest(lx, ly, primitives[j, 2], primitives[j, 3], primitives[j, 6])[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def nearest_on_outline(outline, x, y):
     """Distance, point and outward normal of the outline segment nearest to (x, y)."""
     best = math.inf
@@ -69,7 +73,7 @@ def nearest_on_outline(outline, x, y):
     return math.sqrt(best), bx, by, nx, ny
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def signed_distances(primitives, outline, points, out):
     """Signed distance from every point to the union, exact outside and inside."""
     for k in range(points.shape[0]):
@@ -83,50 +87,50 @@ def signed_distances(primitives, outline, points, out):
         out[k] = distance
 
 
-@njit(cache=True, nogil=True)
-def _outline_contact(outline, x, y, extent, contacts):
-    """One contact that leads a tool whose centre is inside the union out by the nearest visible edge."""
-    depth, px, py, nx, ny = nearest_on_outline(outline, x, y)
-    if depth > 1e-12:
-        nx, ny = (px - x) / depth, (py - y) / depth
-    contacts[0, GAP] = -depth - extent
+@njit(**COMPILED)
+def _outline_contact(outline, x, y, outside, tc, ts, bx, by, radius, contacts):
+    """One contact that leads a tool at (x, y, tc, ts) out past the visible edge nearest to its centre.
+
+    The way out for tools that penetrate so deep that the primitives' own contacts point at each other.
+    """
+    distance, px, py, nx, ny = nearest_on_outline(outline, x, y)
+    if distance > 1e-12:
+        sign = 1.0 if outside else -1.0
+        nx, ny = sign * (x - px) / distance, sign * (y - py) / distance
+    extent = radius + bx * abs(tc * nx + ts * ny) + by * abs(tc * ny - ts * nx)
+    contacts[0, GAP] = (distance if outside else -distance) - extent
     contacts[0, NX], contacts[0, NY] = nx, ny
     contacts[0, PX], contacts[0, PY] = px, py
     return 1, contacts[0, GAP]
 
 
-@njit(cache=True, nogil=True)
-def _disc_against(primitives, j, x, y, radius, contacts, row):
-    """Write the contact of a disc at (x, y) with primitive j; return the gap."""
-    ox, oy = primitives[j, 0], primitives[j, 1]
-    c, s = primitives[j, 4], primitives[j, 5]
-    dx, dy = x - ox, y - oy
-    lx, ly = c * dx + s * dy, c * dy - s * dx
-    distance, nx, ny, sx, sy = _nearest(lx, ly, primitives[j, 2], primitives[j, 3], primitives[j, 6])
-    contacts[row, GAP] = distance - radius
-    contacts[row, NX], contacts[row, NY] = c * nx - s * ny, s * nx + c * ny
-    contacts[row, PX], contacts[row, PY] = ox + c * sx - s * sy, oy + s * sx + c * sy
-    return distance - radius
+@njit(**COMPILED, inline="always")
+def disc_contact(x, y, radius, cx, cy, hx, hy, c, s, r):
+    """Gap, normal and contact point of a disc at (x, y) with the primitive (cx, cy, hx, hy, cos, sin, r)."""
+    dx, dy = x - cx, y - cy
+    distance, nx, ny, sx, sy = _nearest(c * dx + s * dy, c * dy - s * dx, hx, hy, r)
+    return distance - radius, c * nx - s * ny, s * nx + c * ny, cx + c * sx - s * sy, cy + s * sx + c * sy
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def disc_contacts(primitives, outline, x, y, radius, margin, contacts):
     """Contacts of a disc tool at (x, y) with every primitive nearer than `margin`.
 
     Returns:
         number of contacts written, and the signed gap between the tool and the union.
     """
-    if primitives.shape[0] == 1:
-        gap = _disc_against(primitives, 0, x, y, radius, contacts, 0)
-        return (1 if gap < margin else 0), gap
     count = 0
     gap = math.inf
     for j in range(primitives.shape[0]):
-        distance = _disc_against(primitives, j, x, y, radius, contacts, count)
-        if distance < -radius:
-            return _outline_contact(outline, x, y, radius, contacts)
+        cx, cy, hx, hy = primitives[j, 0], primitives[j, 1], primitives[j, 2], primitives[j, 3]
+        c, s, r = primitives[j, 4], primitives[j, 5], primitives[j, 6]
+        distance, nx, ny, px, py = disc_contact(x, y, radius, cx, cy, hx, hy, c, s, r)
+        if distance < -radius and primitives.shape[0] > 1:
+            return _outline_contact(outline, x, y, False, 1.0, 0.0, 0.0, 0.0, radius, contacts)
         gap = min(gap, distance)
         if distance < margin:
+            contacts[count, GAP], contacts[count, NX], contacts[count, NY] = distance, nx, ny
+            contacts[count, PX], contacts[count, PY] = px, py
             contacts[count, 5] = j
             count += 1
     if count > 1:
@@ -134,12 +138,13 @@ def disc_contacts(primitives, outline, x, y, radius, margin, contacts):
     return count, gap
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def _drop_covered(primitives, contacts, count):
     """Drop contacts whose point lies in another primitive that has a contact of its own.
 
-    Keeping that primitive clear of the tool already keeps the point clear, so nothing is lost; inner edges of overlapping or
-    abutting primitives vanish. Two primitives that cover each other's point share it: the first one is kept.
+    Keeping that primitive clear of the tool already keeps the point clear, so nothing is lost; inner edges of
+    overlapping or abutting primitives vanish. Two primitives that cover each other's point share it: the
+    first one is kept.
     """
     kept = 0
     for i in range(count):
@@ -160,29 +165,41 @@ def _drop_covered(primitives, contacts, count):
     return kept
 
 
-@njit(cache=True, nogil=True)
-def rectangle_contacts(primitives, outline, x, y, tc, ts, tool, margin, contacts):
-    """Contacts of a rectangle tool at (x, y), turned by the angle with cosine tc and sine ts; see :func:`disc_contacts`."""
+@njit(**COMPILED)
+def rectangle_contacts(primitives, outline, x, y, tc, ts, bx, by, margin, contacts):
+    """Contacts of a rectangle tool (half sizes bx, by) at (x, y, cos, sin); see :func:`disc_contacts`."""
     if primitives.shape[0] > 1:
         for j in range(primitives.shape[0]):
             if primitive_distance(primitives, j, x, y) < 0.0:
-                return _outline_contact(outline, x, y, min(tool[0], tool[1]), contacts)
+                return _outline_contact(outline, x, y, False, tc, ts, bx, by, 0.0, contacts)
     count = 0
     gap = math.inf
     for j in range(primitives.shape[0]):
         if primitives[j, 6] > 0.0:
-            distance = _rectangle_against_disc(primitives, j, x, y, tc, ts, tool, contacts, count)
+            distance = _rectangle_against_disc(primitives, j, x, y, tc, ts, bx, by, contacts, count)
             added = 1 if distance < margin else 0
         else:
-            added, distance = _rectangle_against_rectangle(primitives, j, x, y, tc, ts, tool, margin, contacts, count)
+            added, distance = _rectangle_against_rectangle(
+                primitives, j, x, y, tc, ts, bx, by, margin, contacts, count
+            )
         gap = min(gap, distance)
         count = _keep_visible(primitives, j, contacts, count, count + added)
+    if count == 0 and gap < -PROBE and primitives.shape[0] > 1:
+        return _outline_contact(outline, x, y, True, tc, ts, bx, by, 0.0, contacts)
     return count, gap
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
+def tool_contacts(primitives, outline, x, y, c, s, hx, hy, radius, margin, contacts):
+    """Contacts of any tool at (x, y, cos, sin): a disc if its radius is positive, else a rectangle."""
+    if radius > 0.0:
+        return disc_contacts(primitives, outline, x, y, radius, margin, contacts)
+    return rectangle_contacts(primitives, outline, x, y, c, s, hx, hy, margin, contacts)
+
+
+@njit(**COMPILED)
 def _keep_visible(primitives, own, contacts, count, end):
-    """Drop new contacts (rows `count` to `end`) that look into another primitive; return the number of contacts left."""
+    """Drop new contacts, rows `count` to `end`, that look into another primitive; return the rows left."""
     for i in range(count, end):
         hidden = False
         x, y = contacts[i, PX] + PROBE * contacts[i, NX], contacts[i, PY] + PROBE * contacts[i, NY]
@@ -196,12 +213,12 @@ def _keep_visible(primitives, own, contacts, count, end):
     return count
 
 
-@njit(cache=True, nogil=True)
-def _rectangle_against_disc(primitives, j, x, y, tc, ts, tool, contacts, row):
+@njit(**COMPILED)
+def _rectangle_against_disc(primitives, j, x, y, tc, ts, bx, by, contacts, row):
     """Mirrored: the disc of the object seen from the tool."""
     dx, dy = primitives[j, 0] - x, primitives[j, 1] - y
     lx, ly = tc * dx + ts * dy, tc * dy - ts * dx
-    distance, nx, ny, _, _ = _nearest(lx, ly, tool[0], tool[1], 0.0)
+    distance, nx, ny, _, _ = _nearest(lx, ly, bx, by, 0.0)
     r = primitives[j, 6]
     contacts[row, GAP] = distance - r
     contacts[row, NX], contacts[row, NY] = ts * ny - tc * nx, -ts * nx - tc * ny
@@ -210,18 +227,22 @@ def _rectangle_against_disc(primitives, j, x, y, tc, ts, tool, contacts, row):
     return distance - r
 
 
-@njit(cache=True, nogil=True)
-def _rectangle_against_rectangle(primitives, j, x, y, tc, ts, tool, margin, contacts, row):
+@njit(**COMPILED)
+def _rectangle_against_rectangle(primitives, j, x, y, tc, ts, bx, by, margin, contacts, row):
     """Separating axis with the contacts of the incident face clipped to the reference face.
 
     Returns:
-        number of contacts written, separation (a lower bound of the distance; exact where it is negative or faces overlap).
+        number of contacts written, separation (a lower bound of the distance; exact where it is negative or
+        faces overlap).
     """
     ox, oy, c, s = primitives[j, 0], primitives[j, 1], primitives[j, 4], primitives[j, 5]
-    ax, ay, bx, by = primitives[j, 2], primitives[j, 3], tool[0], tool[1]
+    ax, ay = primitives[j, 2], primitives[j, 3]
     rc, rs = c * tc + s * ts, c * ts - s * tc  # the tool's turn seen from the primitive
     ux, uy = abs(rc), abs(rs)
-    px, py = c * (x - ox) + s * (y - oy), c * (y - oy) - s * (x - ox)  # the tool's centre seen from the primitive
+    px, py = (
+        c * (x - ox) + s * (y - oy),
+        c * (y - oy) - s * (x - ox),
+    )  # the tool's centre seen from the primitive
     qx, qy = -rc * px - rs * py, rs * px - rc * py  # and the other way round
     sep_a = max(abs(px) - ax - ux * bx - uy * by, abs(py) - ay - uy * bx - ux * by)
     sep_b = max(abs(qx) - bx - ux * ax - uy * ay, abs(qy) - by - uy * ax - ux * ay)
@@ -241,7 +262,7 @@ def _rectangle_against_rectangle(primitives, j, x, y, tc, ts, tool, margin, cont
     return written, separation
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def _to_parent(contacts, i, c, s, x, y):
     """Express a contact in the frame in which its present frame has pose (x, y) and turn (c, s)."""
     nx, ny, px, py = contacts[i, NX], contacts[i, NY], contacts[i, PX], contacts[i, PY]
@@ -249,12 +270,13 @@ def _to_parent(contacts, i, c, s, x, y):
     contacts[i, PX], contacts[i, PY] = x + c * px - s * py, y + s * px + c * py
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def _clip(px, py, c, s, rx, ry, hx, hy, along_x, mirrored, margin, contacts, row):
-    """Contacts between a face of a reference rectangle (rx, ry) at the origin and an incident one (hx, hy) at (px, py).
+    """Contacts of a face of a reference rectangle (rx, ry) at the origin with one (hx, hy) at (px, py, c, s).
 
-    The face looks along x or y towards the incident rectangle. Without `mirrored` the reference is the object, and normals and
-    points are its face's; with it the reference is the tool, and the points are the incident vertices.
+    The face looks along x or y towards the incident rectangle. Without `mirrored` the reference is the
+    object, and normals and points are its face's; with it the reference is the tool, and the points are the
+    incident vertices.
     """
     if not along_x:  # work along x: swap the axes, which also turns the sense of rotation
         px, py, s, rx, ry, hx, hy = py, px, -s, ry, rx, hy, hx

@@ -17,7 +17,8 @@ def visible_segments(rows: np.ndarray) -> np.ndarray:
         rows: primitives (cx, cy, hx, hy, angle, radius), shape (P, 6).
 
     Returns:
-        segments (x0, y0, x1, y1, nx, ny, primitive) in counter-clockwise order around their primitive, shape (S, 7).
+        segments (x0, y0, x1, y1, nx, ny, primitive) in counter-clockwise order around their primitive, shape
+        (S, 7).
     """
     offset = OFFSET * float(np.max(rows[:, 2:4].sum(1) + rows[:, 5]))
     found = []
@@ -32,7 +33,7 @@ def visible_segments(rows: np.ndarray) -> np.ndarray:
 
 
 def primitive_polygon(row: np.ndarray, disc_segments: int = DISC_SEGMENTS) -> tuple[np.ndarray, np.ndarray]:
-    """Corners, shape (V, 2), counter-clockwise, and the outward normal of the edge after each corner, shape (V, 2)."""
+    """Corners counter-clockwise, (V, 2), and the outward normal of the edge after each, (V, 2)."""
     center, half, angle, radius = row[:2], row[2:4], row[4], row[5]
     if radius > 0.0:
         corner = 2 * math.pi * np.arange(disc_segments) / disc_segments
@@ -48,8 +49,8 @@ def primitive_polygon(row: np.ndarray, disc_segments: int = DISC_SEGMENTS) -> tu
 def _hidden_intervals(rows, i, start, end, shift) -> list[tuple[float, float]]:
     """Parts of an edge, as parameters in [0, 1], that other primitives cover.
 
-    What lies just outside the edge decides: an edge shared with an abutting neighbour is inside the union, a flush one is not. A
-    flush edge is kept for the first primitive only.
+    What lies just outside the edge decides: an edge shared with an abutting neighbour is inside the union, a
+    flush one is not. A flush edge is kept for the first primitive only.
     """
     hidden = []
     for j, row in enumerate(rows):

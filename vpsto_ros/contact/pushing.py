@@ -1,11 +1,12 @@
 """Quasi-static planar pushing: the object dynamics of eq. (6.5a)–(6.5c) for a tool that slides on the object.
 
-The thesis takes the inertia matrix for M in eq. (6.5b). What resists a slow push is friction with the table, so M is the metric of
-the ellipsoidal limit surface instead: friction wrenches (fx, fy, m) about the centre of friction satisfy
-``f^2 + (m / c)^2 = f_max^2`` while sliding, the twist is normal to that surface, ``(v, w) ~ (f, m / c^2)``, hence
-``M^-1 = diag(1, 1, 1 / c^2)`` and ``M = diag(1, 1, c^2)`` up to a factor that does not matter. The pressure radius
-``c = m_max / f_max`` is the mean distance of the supporting area to the centre of friction. Contacts obey Coulomb's law in
-addition: the tool drags the object along its surface with at most `friction` times the normal impulse.
+The thesis takes the inertia matrix for M in eq. (6.5b). What resists a slow push is friction with the table,
+so M is the metric of the ellipsoidal limit surface instead: friction wrenches (fx, fy, m) about the centre of
+friction satisfy ``f^2 + (m / c)^2 = f_max^2`` while sliding, the twist is normal to that surface, ``(v, w) ~
+(f, m / c^2)``, hence ``M^-1 = diag(1, 1, 1 / c^2)`` and ``M = diag(1, 1, c^2)`` up to a factor that does not
+matter. The pressure radius ``c = m_max / f_max`` is the mean distance of the supporting area to the centre of
+friction. Contacts obey Coulomb's law in addition: the tool drags the object along its surface with at most
+`friction` times the normal impulse.
 """
 
 import math
@@ -57,7 +58,7 @@ class PushingModel:
 
     @cached_property
     def tool_row(self) -> np.ndarray:
-        """The tool for the kernels: half sizes, radius, bounding radius; its place in its frame goes into the path."""
+        """The tool for the kernels: half sizes, radius, bounding radius; its offset goes into the path."""
         row = self.tool.as_array()[0]
         return np.array([row[2], row[3], row[5], math.hypot(row[2], row[3]) + row[5]])
 
@@ -85,17 +86,18 @@ def rollout(
     pressure_radius: np.ndarray | None = None,
     friction: np.ndarray | None = None,
     center_of_friction: np.ndarray | None = None,
-    max_step: float = 0.004,
+    max_step: float = 0.006,
 ) -> PushRollout:
     """Predict how objects move when tools follow paths, eq. (6.6) applied along each path.
 
-    The object's first pose is the start, moved out of the tool by the shortest way if they overlap. Inputs that are given once
-    are shared by all B rollouts.
+    The object's first pose is the start, moved out of the tool by the shortest way if they overlap. Inputs
+    that are given once are shared by all B rollouts.
 
     Args:
         model: object, tool and friction.
         object_pose: start (x, y, yaw), world, shape (3,) or (B, 3).
-        tool_path: samples of the tool's pose, world, shape (K, 2), (K, 3), (B, K, 2) or (B, K, 3); without yaw it is 0.
+        tool_path: samples of the tool's pose, world, shape (K, 2), (K, 3), (B, K, 2) or (B, K, 3); without
+            yaw it is 0.
         pressure_radius: instead of the model's [m], scalar or shape (B,).
         friction: instead of the model's, scalar or shape (B,).
         center_of_friction: instead of the model's, object frame [m], shape (2,) or (B, 2).
@@ -106,20 +108,27 @@ def rollout(
     """
     start = _rows("object_pose", object_pose, (3,))
     path = _placed_tool(model, _path(tool_path))
-    radius = _rows("pressure_radius", model.pressure_radius if pressure_radius is None else pressure_radius, ())
+    radius = _rows(
+        "pressure_radius", model.pressure_radius if pressure_radius is None else pressure_radius, ()
+    )
     mu = _rows("friction", model.friction if friction is None else friction, ())
     center = _rows(
-        "center_of_friction", model.center_of_friction if center_of_friction is None else center_of_friction, (2,)
+        "center_of_friction",
+        model.center_of_friction if center_of_friction is None else center_of_friction,
+        (2,),
     )
     if radius.min(initial=1.0) <= 0.0 or mu.min(initial=0.0) < 0.0:
         raise InvalidInputError("pressure_radius must be positive and friction not negative")
     if not (math.isfinite(max_step) and max_step > 0.0):
         raise InvalidInputError(f"max_step must be positive, got {max_step}")
-    batch = _batch_size(object_pose=start, tool_path=path, pressure_radius=radius, friction=mu, center_of_friction=center)
+    batch = _batch_size(
+        object_pose=start, tool_path=path, pressure_radius=radius, friction=mu, center_of_friction=center
+    )
     poses = np.empty((batch, path.shape[1], 3))
     touched = np.zeros((batch, path.shape[1]), dtype=np.bool_)
     penetration = np.empty(batch)
-    # Steps longer than half the tool could put its centre beyond the surface, where the nearest side may be the wrong one.
+    # Steps longer than half the tool could put its centre beyond the surface, where the nearest side may be
+    # the wrong one.
     tool = model.tool_row
     step = min(max_step, 0.5 * (tool[2] if tool[2] > 0.0 else min(tool[0], tool[1])))
     rollout_kernel.rollout_batch(
@@ -136,7 +145,7 @@ def push_directions(
     *,
     object_pose: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Twist of the object per unit of tool motion, for tools that touch it: where and whither a push does what.
+    """First-order response of the object to the motion of a tool that touches it: which push does what.
 
     The tool is taken to touch the object at its nearest point; a motion away from the object gives zero.
 
@@ -144,16 +153,16 @@ def push_directions(
         model: object, tool and friction.
         contact_points: tool centres, shape (K, 2).
         directions: motion of the tool [m], shape (K, 2); the response is linear in its length.
-        object_pose: (x, y, yaw) of the object if points and directions are in the world frame; None if in the object frame.
+        object_pose: (x, y, yaw) of the object if points and directions are in the world frame; None if in the
+            object frame.
 
     Returns:
         displacement of the object's origin and turn (dx, dy, dyaw) in the frame of the inputs, shape (K, 3).
     """
     points, motion = _finite("contact_points", contact_points), _finite("directions", directions)
     if points.ndim != 2 or points.shape[1] != 2 or motion.shape != points.shape:
-        raise InvalidInputError(
-            f"contact_points and directions must both have shape (K, 2), got {points.shape} and {motion.shape}"
-        )
+        shapes = f"{points.shape} and {motion.shape}"
+        raise InvalidInputError(f"contact_points and directions must both have shape (K, 2), got {shapes}")
     turn = np.eye(2)
     if object_pose is not None:
         x, y, yaw = _rows("object_pose", object_pose, (3,))[0]
@@ -165,7 +174,8 @@ def push_directions(
     twists = np.empty((len(points), 3))
     rollout_kernel.push_response(
         model.shape.kernel_rows, model.shape.outline_segments, model.tool_row, points,
-        np.ascontiguousarray(motion @ turn), model.pressure_radius, model.friction, *model.center_of_friction, twists,
+        np.ascontiguousarray(motion @ turn), model.pressure_radius, model.friction, *model.center_of_friction,
+        twists,
     )  # fmt: skip
     twists[:, :2] = twists[:, :2] @ turn.T
     return twists
@@ -192,9 +202,8 @@ def _path(tool_path) -> np.ndarray:
     path = np.ascontiguousarray(_finite("tool_path", tool_path))
     path = path[None] if path.ndim == 2 else path
     if path.ndim != 3 or path.shape[1] < 1 or path.shape[2] not in (2, 3):
-        raise InvalidInputError(
-            f"tool_path must have shape (K, 2), (K, 3), (B, K, 2) or (B, K, 3) with K >= 1, got {np.shape(tool_path)}"
-        )
+        allowed = "(K, 2), (K, 3), (B, K, 2) or (B, K, 3) with K >= 1"
+        raise InvalidInputError(f"tool_path must have shape {allowed}, got {np.shape(tool_path)}")
     return path
 
 

@@ -1,7 +1,10 @@
 """Compiled rollouts: tools move along sampled paths, objects give way quasi-statically, eq. (6.5a)–(6.5c).
 
-The tool moves straight from sample to sample. Conservative advancement skips what cannot touch: as long as the object stands
-still, the last gap bounds how far the tool may travel unseen.
+The tool moves straight from sample to sample. Conservative advancement skips what cannot touch: as long as
+the object stands still, the last gap bounds how far the tool may travel unseen.
+
+Poses travel as scalars (x, y, cos, sin) and small helpers are inlined: passing arrays or slices between
+compiled functions costs more than the arithmetic of a step.
 """
 
 import math
@@ -9,152 +12,195 @@ import math
 import numpy as np
 from numba import njit
 
-from vpsto_ros.contact.narrow_phase import GAP, NX, NY, PX, PY, disc_contacts, rectangle_contacts
-from vpsto_ros.contact.projection import CONTACT_COLUMNS, SLIP, solve_contacts
+from vpsto_ros.contact.narrow_phase import COMPILED, GAP, NX, NY, PX, PY, disc_contact, tool_contacts
+from vpsto_ros.contact.projection import CONTACT_COLUMNS, SLIP, refine_contact, solve_contact, solve_contacts
 
 PENETRATION_TOLERANCE = 1e-6
+# A correction this small leaves a gap well below the tolerance: the error is quadratic.
+SMALL_CHANGE = 1e-4
 STEP_ITERATIONS = 8
 START_ITERATIONS = 60
 # Longest displacement of one linearised projection: what a regular step needs, times this.
 STEP_CAP = 2.0
 
 
-@njit(cache=True, nogil=True)
-def find_contacts(primitives, outline, tool, pose, tx, ty, tc, ts, margin, contacts):
-    """Contacts in the object frame for a tool at world position (tx, ty), turned by the angle with cosine tc and sine ts."""
-    dx, dy = tx - pose[0], ty - pose[1]
-    c, s = pose[3], pose[4]
-    x, y = c * dx + s * dy, c * dy - s * dx
-    if tool[2] > 0.0:
-        return disc_contacts(primitives, outline, x, y, tool[2], margin, contacts)
-    return rectangle_contacts(primitives, outline, x, y, c * tc + s * ts, c * ts - s * tc, tool, margin, contacts)
+@njit(**COMPILED, inline="always")
+def _tool_motion(px, py, ox, oy, c, s, bx, by, bc, bs, tx, ty, tc, ts):
+    """Displacement, in the object frame, of the tool's surface where it touches the object at (px, py).
+
+    The tool went from (bx, by, bc, bs) to (tx, ty, tc, ts); the object is at (ox, oy, c, s).
+    """
+    ax, ay = ox + c * px - s * py - tx, oy + s * px + c * py - ty
+    rc, rs = tc * bc + ts * bs, bs * tc - bc * ts  # the turn that leads the tool back to where it was
+    wx, wy = tx + ax - bx - rc * ax + rs * ay, ty + ay - by - rs * ax - rc * ay
+    return c * wx + s * wy, c * wy - s * wx
 
 
-@njit(cache=True, nogil=True)
-def _set_slip(contacts, count, pose, before, now):
-    """Tangential displacement that keeps every contact from sliding: the tool's, for the part of the step in contact."""
-    c, s = pose[3], pose[4]
-    # Turn and shift that lead the tool back to where it was before this step.
-    dc, ds = now[2] * before[2] + now[3] * before[3], before[3] * now[2] - before[2] * now[3]
-    for i in range(count):
-        ax = pose[0] + c * contacts[i, PX] - s * contacts[i, PY] - now[0]
-        ay = pose[1] + s * contacts[i, PX] + c * contacts[i, PY] - now[1]
-        wx = now[0] + ax - before[0] - dc * ax + ds * ay
-        wy = now[1] + ay - before[1] - ds * ax - dc * ay
-        mx, my = c * wx + s * wy, c * wy - s * wx
-        nx, ny = contacts[i, NX], contacts[i, NY]
-        approach = -nx * mx - ny * my
-        depth = -contacts[i, GAP]
-        part = depth / approach if 0.0 < depth < approach else 1.0
-        contacts[i, SLIP] = part * (nx * my - ny * mx)
+@njit(**COMPILED, inline="always")
+def _part_in_contact(gap, nx, ny, mx, my):
+    """Part of the tool's motion (mx, my) during which it is in contact, if it ends at this gap."""
+    approach = -nx * mx - ny * my
+    return -gap / approach if 0.0 < -gap < approach else 1.0
 
 
-@njit(cache=True, nogil=True)
-def _move(pose, vx, vy, w, fx, fy):
-    """Move the object by a twist about its centre of friction (fx, fy), all in the object frame."""
-    c, s = pose[3], pose[4]
-    if abs(w) < 0.1:
-        q = w * w
-        cw = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q / 720.0))
-        sw = w * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)))
+@njit(**COMPILED, inline="always")
+def _move(ox, oy, c, s, vx, vy, w, fx, fy):
+    """Pose of an object after a constant body twist about its centre of friction (fx, fy)."""
+    if abs(w) < 0.2:
+        q = 0.25 * w * w
+        ch = 1.0 - q * (0.5 - q * (1.0 / 24.0 - q / 720.0))
+        sh = 0.5 * w * (1.0 - q * (1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)))
     else:
-        cw, sw = math.cos(w), math.sin(w)
-    # The centre moves by (vx, vy), the origin follows the turn about it.
-    lx = fx + vx - cw * fx + sw * fy
-    ly = fy + vy - sw * fx - cw * fy
-    pose[0] += c * lx - s * ly
-    pose[1] += s * lx + c * ly
-    pose[2] += w
+        ch, sh = math.cos(0.5 * w), math.sin(0.5 * w)
+    cw, sw = 1.0 - 2.0 * sh * sh, 2.0 * sh * ch
+    # The centre moves along the velocity half-way, the origin follows the turn about it.
+    lx = fx + ch * vx - sh * vy - cw * fx + sw * fy
+    ly = fy + sh * vx + ch * vy - sw * fx - cw * fy
     nc, ns = c * cw - s * sw, s * cw + c * sw
     unit = 1.5 - 0.5 * (nc * nc + ns * ns)  # keeps cosine and sine normalised over thousands of steps
-    pose[3], pose[4] = nc * unit, ns * unit
+    return ox + c * lx - s * ly, oy + s * lx + c * ly, nc * unit, ns * unit
 
 
-@njit(cache=True, nogil=True)
-def _give_way(primitives, outline, tool, pose, before, now, k, friction, fx, fy, margin, cap, iterations, contacts):
-    """Project the object out of the tool; friction acts in the first linearisation, the rest removes its curvature error.
+@njit(**COMPILED)
+def _set_slips(contacts, count, ox, oy, c, s, bx, by, bc, bs, tx, ty, tc, ts):
+    """Tangential displacement that keeps each of several contacts from sliding."""
+    for j in range(count):
+        nx, ny = contacts[j, NX], contacts[j, NY]
+        mx, my = _tool_motion(contacts[j, PX], contacts[j, PY], ox, oy, c, s, bx, by, bc, bs, tx, ty, tc, ts)
+        contacts[j, SLIP] = _part_in_contact(contacts[j, GAP], nx, ny, mx, my) * (nx * my - ny * mx)
 
-    Returns:
-        gap that is left, and whether the object was moved.
+
+@njit(**COMPILED, inline="always")
+def _rest_after_hop(rest, clear, step):
+    """Way left to the next sample after a hop: at once through free space, in short steps near the object."""
+    if clear > step:
+        return rest - clear
+    return rest - rest / math.ceil(rest / step) if rest > step else 0.0
+
+
+@njit(**COMPILED, inline="always")
+def _limited(vx, vy, w, k, cap):
+    """Twist scaled down to at most `cap` in the metric of the limit surface, and whether that was needed."""
+    size = vx * vx + vy * vy + w * w / k
+    scale = cap / math.sqrt(size) if size > cap * cap else 1.0
+    return scale * vx, scale * vy, scale * w, scale < 1.0
+
+
+@njit(**COMPILED)
+def _rollout_one(primitives, outline, tool, paths, p, k, mu, fx, fy, step, contacts, poses, touched, b):
+    """Roll out object b, whose start is in poses[b, 0], along path p; return the worst gap.
+
+    Names: object (ox, oy, yaw; c, s), before the step (qx, qy, qc, qs), half-turned (hc, hs); tool (tx, ty,
+    tc, ts), before the step (bx, by, bc, bs); path from sample (sx, sy, sa) to (ex, ey, ea); contact (nx, ny,
+    px, py), at the end of the last step (nx0, ny0, px0, py0); twist (vx, vy, w), refined (ux, uy, u).
     """
-    touched = False
-    gap = 0.0
-    for iteration in range(iterations + 1):
-        count, gap = find_contacts(
-            primitives, outline, tool, pose, now[0], now[1], now[2], now[3], margin, contacts
-        )
-        if gap >= -PENETRATION_TOLERANCE or count == 0 or iteration == iterations:
-            break
-        touched = True
-        mu = friction if iteration == 0 else 0.0
-        if mu > 0.0:
-            _set_slip(contacts, count, pose, before, now)
-        vx, vy, w = solve_contacts(contacts, count, k, mu, fx, fy)
-        size = math.sqrt(vx * vx + vy * vy + w * w / k)
-        scale = cap / size if size > cap else 1.0
-        _move(pose, scale * vx, scale * vy, scale * w, fx, fy)
-    return gap, touched
+    thx, thy, radius, reach = tool[0], tool[1], tool[2], tool[3]
+    single = radius > 0.0 and primitives.shape[0] == 1
+    cx, cy, hx, hy = primitives[0, 0], primitives[0, 1], primitives[0, 2], primitives[0, 3]
+    pc, ps, pr = primitives[0, 4], primitives[0, 5], primitives[0, 6]
+    turning = paths.shape[2] == 3
+    ox, oy, yaw = poses[b, 0, 0], poses[b, 0, 1], poses[b, 0, 2]
+    c, s = math.cos(yaw), math.sin(yaw)
+    worst, clear, cap = 0.0, -1.0, STEP_CAP * step
+    touching = False
+    nx0 = ny0 = px0 = py0 = vx = vy = w = slip = qx = qy = qc = qs = hc = hs = ta = ea = 0.0
+    tc, ts, ex, ey = 1.0, 0.0, paths[p, 0, 0], paths[p, 0, 1]
+    if turning:
+        ea = paths[p, 0, 2]
+        tc, ts = math.cos(ea), math.sin(ea)
+    tx, ty = ex, ey
+    for i in range(paths.shape[1]):
+        sx, sy, sa = ex, ey, ea
+        ex, ey = paths[p, i, 0], paths[p, i, 1]
+        if turning:
+            ea = paths[p, i, 2]
+        length = math.sqrt((ex - sx) ** 2 + (ey - sy) ** 2) + abs(ea - sa) * reach
+        rest = length
+        moved = False
+        iterations = START_ITERATIONS if i == 0 else STEP_ITERATIONS
+        while rest > clear:
+            rest = _rest_after_hop(rest, clear, step)
+            bx, by, bc, bs = tx, ty, tc, ts
+            back = rest / length if rest > 0.0 else 0.0
+            tx, ty = ex + back * (sx - ex), ey + back * (sy - ey)
+            if turning:
+                ta = ea + back * (sa - ea)
+                tc, ts = math.cos(ta), math.sin(ta)
+            gap, part, refine, refined = 0.0, 1.0, False, False
+            for iteration in range(iterations + 1):
+                dx, dy = tx - ox, ty - oy
+                lx, ly, count = c * dx + s * dy, c * dy - s * dx, 1
+                if single:
+                    gap, nx, ny, px, py = disc_contact(lx, ly, radius, cx, cy, hx, hy, pc, ps, pr)
+                else:
+                    rc, rs = c * tc + s * ts, c * ts - s * tc
+                    count, gap = tool_contacts(
+                        primitives, outline, lx, ly, rc, rs, thx, thy, radius, step, contacts
+                    )
+                    nx, ny, px, py = contacts[0, NX], contacts[0, NY], contacts[0, PX], contacts[0, PY]
+                if refine and iteration == 1 and count == 1:
+                    # Redo the step with the contact half-way.
+                    mx, my = _tool_motion(px, py, qx, qy, hc, hs, bx, by, bc, bs, tx, ty, tc, ts)
+                    slip = part * (0.5 * (nx + nx0) * my - 0.5 * (ny + ny0) * mx)
+                    ux, uy, u = refine_contact(
+                        vx, vy, w, gap, nx, ny, px, py, nx0, ny0, px0, py0, slip, k, mu, fx, fy
+                    )
+                    change = (ux - vx) ** 2 + (uy - vy) ** 2 + (u - w) ** 2 / k
+                    if (
+                        change < 0.25 * step * step
+                    ):  # otherwise the contact jumped, and half-way means nothing
+                        refined = True
+                        nx0, ny0, px0, py0 = nx, ny, px, py
+                        yaw += u - w
+                        ox, oy, c, s = _move(qx, qy, qc, qs, ux, uy, u, fx, fy)
+                        if change < SMALL_CHANGE * SMALL_CHANGE:
+                            gap = 0.0
+                            break
+                        continue
+                if gap >= -PENETRATION_TOLERANCE or count == 0 or iteration == iterations:
+                    break
+                moved = True
+                # Friction acts in the first linearisation; the others only remove what curvature leaves.
+                friction = mu if iteration == 0 and i > 0 else 0.0
+                if count == 1:
+                    if friction > 0.0:
+                        mx, my = _tool_motion(px, py, ox, oy, c, s, bx, by, bc, bs, tx, ty, tc, ts)
+                        part = _part_in_contact(gap, nx, ny, mx, my)
+                        slip = part * (nx * my - ny * mx)
+                    vx, vy, w = solve_contact(gap, nx, ny, px, py, slip, k, friction, fx, fy)
+                else:
+                    if friction > 0.0:
+                        _set_slips(contacts, count, ox, oy, c, s, bx, by, bc, bs, tx, ty, tc, ts)
+                    vx, vy, w = solve_contacts(contacts, count, k, friction, fx, fy)
+                vx, vy, w, limited = _limited(vx, vy, w, k, cap)
+                refine = count == 1 and iteration == 0 and i > 0 and not limited
+                if not touching:
+                    nx0, ny0, px0, py0 = nx, ny, px, py
+                qx, qy, qc, qs = ox, oy, c, s
+                hc, hs = c - 0.5 * w * s, s + 0.5 * w * c
+                ox, oy, c, s = _move(ox, oy, c, s, vx, vy, w, fx, fy)
+                yaw += w
+            touching = refined
+            worst = min(worst, gap)
+            clear = max(gap, 0.0)
+        clear -= rest
+        tx, ty = ex, ey
+        if turning and rest > 0.0:
+            tc, ts = math.cos(ea), math.sin(ea)
+        poses[b, i, 0], poses[b, i, 1], poses[b, i, 2] = ox, oy, yaw
+        touched[b, i] = moved
+    return worst
 
 
-@njit(cache=True, nogil=True)
-def _set_tool(row, out):
-    out[0], out[1] = row[0], row[1]
-    if row.shape[0] == 3:
-        out[2], out[3] = math.cos(row[2]), math.sin(row[2])
-
-
-@njit(cache=True, nogil=True)
-def _advance(primitives, outline, tool, pose, start, end, clear, k, friction, fx, fy, step, contacts, before, now):
-    """Move the tool straight from path sample `start` to `end`.
-
-    Returns:
-        distance the tool may travel from there unseen, worst gap, whether the object was moved.
-    """
-    turn = end[2] - start[2] if start.shape[0] == 3 else 0.0
-    length = math.sqrt((end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2) + abs(turn) * tool[3]
-    worst = 0.0
-    touched = False
-    done = 0.0
-    while length - done > clear:
-        rest = length - done
-        if clear > step:
-            # Nothing can happen before this much is travelled; look again there.
-            done += clear
-            _interpolate(start, end, done / length, now)
-            _, clear = find_contacts(
-                primitives, outline, tool, pose, now[0], now[1], now[2], now[3], 0.0, contacts
-            )
-            clear = max(clear, 0.0)
-            continue
-        _interpolate(start, end, done / length, before)
-        done = length if rest <= step else done + rest / math.ceil(rest / step)
-        _interpolate(start, end, done / length, now)
-        gap, moved = _give_way(
-            primitives, outline, tool, pose, before, now, k, friction, fx, fy, step, STEP_CAP * step,
-            STEP_ITERATIONS, contacts,
-        )  # fmt: skip
-        worst = min(worst, gap)
-        touched = touched or moved
-        clear = max(gap, 0.0)
-    return clear - (length - done), worst, touched
-
-
-@njit(cache=True, nogil=True)
-def _interpolate(start, end, part, out):
-    out[0] = start[0] + part * (end[0] - start[0])
-    out[1] = start[1] + part * (end[1] - start[1])
-    if start.shape[0] == 3:
-        yaw = start[2] + part * (end[2] - start[2])
-        out[2], out[3] = math.cos(yaw), math.sin(yaw)
-
-
-@njit(cache=True, nogil=True)
-def rollout_batch(primitives, outline, tool, start, paths, radius, friction, center, step, poses, touched, penetration):
+@njit(**COMPILED)
+def rollout_batch(
+    primitives, outline, tool, start, paths, radius, friction, center, step, poses, touched, penetration
+):
     """Roll out B objects; every input with one row is shared by all of them.
 
     Args:
         primitives: object, shape (P, 7).
-        outline: visible outline, shape (S, 6).
+        outline: visible outline, shape (S, 7).
         tool: half sizes, radius and bounding radius, shape (4,).
         start: object poses, shape (1 or B, 3).
         paths: tool centres, shape (1 or B, K, 2 or 3).
@@ -167,42 +213,31 @@ def rollout_batch(primitives, outline, tool, start, paths, radius, friction, cen
         penetration: output, shape (B,).
     """
     contacts = np.zeros((2 * primitives.shape[0], CONTACT_COLUMNS))
-    pose = np.zeros(5)
-    before = np.array([0.0, 0.0, 1.0, 0.0])
-    now = np.array([0.0, 0.0, 1.0, 0.0])
     for b in range(poses.shape[0]):
-        path = paths[min(b, paths.shape[0] - 1)]
-        pose[:3] = start[min(b, start.shape[0] - 1)]
-        pose[3], pose[4] = math.cos(pose[2]), math.sin(pose[2])
+        first = min(b, start.shape[0] - 1)
+        poses[b, 0, 0], poses[b, 0, 1], poses[b, 0, 2] = start[first, 0], start[first, 1], start[first, 2]
+        p = min(b, paths.shape[0] - 1)
         k = radius[min(b, radius.shape[0] - 1)] ** -2
         mu = friction[min(b, friction.shape[0] - 1)]
-        fx, fy = center[min(b, center.shape[0] - 1)]
-        _set_tool(path[0], now)
-        gap, moved = _give_way(
-            primitives, outline, tool, pose, now, now, k, 0.0, fx, fy, step, STEP_CAP * step, START_ITERATIONS, contacts
+        f = min(b, center.shape[0] - 1)
+        fx, fy = center[f, 0], center[f, 1]
+        worst = _rollout_one(
+            primitives, outline, tool, paths, p, k, mu, fx, fy, step, contacts, poses, touched, b
         )
-        poses[b, 0], touched[b, 0] = pose[:3], moved
-        worst, clear = min(gap, 0.0), max(gap, 0.0)
-        for i in range(1, path.shape[0]):
-            clear, gap, moved = _advance(
-                primitives, outline, tool, pose, path[i - 1], path[i], clear, k, mu, fx, fy, step, contacts, before, now
-            )
-            worst = min(worst, gap)
-            poses[b, i, 0], poses[b, i, 1], poses[b, i, 2] = pose[0], pose[1], pose[2]
-            touched[b, i] = moved
-        penetration[b] = max(-worst - PENETRATION_TOLERANCE, 0.0)
+        penetration[b] = -worst if worst < -PENETRATION_TOLERANCE else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(**COMPILED)
 def push_response(primitives, outline, tool, points, directions, radius, friction, fx, fy, twists):
-    """First-order response of the object to a touching tool; see :func:`vpsto_ros.contact.pushing.push_directions`."""
+    """First-order response to a touching tool; see `vpsto_ros.contact.pushing.push_directions`."""
     contacts = np.zeros((2 * primitives.shape[0], CONTACT_COLUMNS))
-    pose = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
-    tool_pose = np.array([0.0, 0.0, 1.0, 0.0])
+    hx, hy, r = tool[0], tool[1], tool[2]
     for i in range(points.shape[0]):
-        _set_tool(points[i], tool_pose)
-        count, gap = find_contacts(
-            primitives, outline, tool, pose, tool_pose[0], tool_pose[1], tool_pose[2], tool_pose[3], np.inf, contacts
+        c, s = 1.0, 0.0
+        if points.shape[1] == 3:
+            c, s = math.cos(points[i, 2]), math.sin(points[i, 2])
+        count, gap = tool_contacts(
+            primitives, outline, points[i, 0], points[i, 1], c, s, hx, hy, r, np.inf, contacts
         )
         used = 0
         for j in range(count):
