@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory.timing import Limits
 
 KINDS = (
@@ -39,7 +40,13 @@ class LimitMonitor:
     """
 
     def __init__(self, limits: Limits):
-        """Watch these limits; position limits must be given."""
+        """Watch these limits.
+
+        Raises:
+            InvalidInputError: the position limits are not given.
+        """
+        if limits.lower is None or limits.upper is None:
+            raise InvalidInputError("a monitor needs limits with a position range; lower or upper is None")
         middle, half = 0.5 * (limits.upper + limits.lower), 0.5 * (limits.upper - limits.lower)
         self._bounds = np.array([middle, half, limits.velocity, limits.acceleration])
         self.reset()

@@ -137,7 +137,8 @@ class Scene:
                 )
             return table.joints([self.start_tool])[0]
         q = np.array(self.start_joints, dtype=float)
-        if q.shape != (7,) or not np.all((q >= robot.limits.lower) & (q <= robot.limits.upper)):
+        lower, upper = robot.position_range
+        if q.shape != (7,) or not np.all((q >= lower) & (q <= upper)):
             raise ConfigurationError(
                 f"Scene.start_joints = {self.start_joints} must be 7 angles within the joint limits"
             )

@@ -247,8 +247,8 @@ class Simulation:
         """
         x, y, yaw = _vector(self.scene.object_pose if object_pose is None else object_pose, "object_pose", 3)
         q = _vector(self.scene.joints() if joints is None else joints, "joints", 7)
-        limits = self.robot.limits
-        if np.any(q < limits.lower) or np.any(q > limits.upper):
+        lower, upper = self.robot.position_range
+        if np.any(q < lower) or np.any(q > upper):
             raise InvalidInputError(f"joints {np.round(q, 3).tolist()} are beyond their position limits")
         data = self.data
         data.qvel[:] = 0.0
@@ -269,7 +269,7 @@ class Simulation:
     def _disturb(self, now: float) -> None:
         """Add up the disturbances of this instant; drop those that are over."""
         self._wrench[:] = 0.0
-        running = []
+        running: list[_Push | _Hand] = []
         for disturbance in self._disturbances:
             if isinstance(disturbance, _Push) and now < disturbance.end:
                 self._wrench += disturbance.wrench

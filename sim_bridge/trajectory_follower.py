@@ -106,6 +106,7 @@ class TrajectoryFollower:
                 f"{len(self._names)} joint names, {limits.dof} limits and {np.size(start)} positions do not "
                 "fit together"
             )
+        self._next = np.inf
         self.hold(start, 0.0)
 
     @property
@@ -160,7 +161,7 @@ class TrajectoryFollower:
         if times.ndim != 1 or times.size == 0:
             raise TrajectoryRejected("empty", "it has no points; send at least one")
         shape = (len(times), len(self._names))
-        columns = []
+        columns: list[NDArray[np.float64] | None] = []
         for name in ("positions", "velocities", "accelerations"):
             values = getattr(command, name)
             if values is None and name != "positions":
@@ -311,7 +312,7 @@ class TrajectoryFollower:
         return part.state(t)
 
     def _set_schedule(self, schedule: list[tuple[float, Trajectory]]) -> None:
-        self._schedule = schedule
+        self._schedule: list[tuple[float, Trajectory]] = schedule
         self._next = schedule[1][0] if len(schedule) > 1 else np.inf
 
 

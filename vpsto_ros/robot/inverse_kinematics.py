@@ -60,16 +60,16 @@ class TableMap:
             )
 
     def _find_radius_range(self, margin: float) -> tuple[float, float]:
-        limits = self._robot.limits
+        lower, upper = self._robot.position_range
         radii = np.linspace(fr3.WRIST_OFFSET + 1e-3, fr3.WRIST_OFFSET + UPPER_ARM + FOREARM, 7201)
         reach = np.hypot(radii - fr3.WRIST_OFFSET, self._wrist_height)
         radii = radii[(reach < UPPER_ARM + FOREARM - 1e-6) & (reach > abs(FOREARM - UPPER_ARM) + 1e-6)]
         angles = self.radial(radii).angle
         index = [1, 3, 5]
-        inside = (angles >= limits.lower[index] + margin) & (angles <= limits.upper[index] - margin)
+        inside = (angles >= lower[index] + margin) & (angles <= upper[index] - margin)
         bent = angles[:, 1] < STRAIGHT_ELBOW - _STRETCH_MARGIN
         good = np.flatnonzero(inside.all(axis=1) & bent)
-        if len(good) == 0 or not limits.lower[6] <= self._tool_yaw <= limits.upper[6]:
+        if len(good) == 0 or not lower[6] <= self._tool_yaw <= upper[6]:
             raise InvalidInputError(
                 f"no posture within the joint limits holds the upright tool at height {self.height} m"
             )
@@ -245,7 +245,8 @@ def solve(
         )
     if rotation is not None and np.shape(rotation) != (3, 3):
         raise InvalidInputError(f"rotation must have shape (3, 3), got {np.shape(rotation)}")
-    q = np.clip(q, robot.limits.lower, robot.limits.upper)
+    lower, upper = robot.position_range
+    q = np.clip(q, lower, upper)
     error, boost = _pose_error(robot, q, position, rotation), 1.0
     for _ in range(iterations):
         if np.abs(error).max() < tolerance:
@@ -253,7 +254,7 @@ def solve(
         jacobian = robot.jacobian(q)[: len(error)]
         damping = boost * 1e-3 * min(1.0, float(error @ error)) + 1e-12
         step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(len(error)), error)
-        trial = np.clip(q + step * min(1.0, 0.5 / np.abs(step).max()), robot.limits.lower, robot.limits.upper)
+        trial = np.clip(q + step * min(1.0, 0.5 / np.abs(step).max()), lower, upper)
         trial_error = _pose_error(robot, trial, position, rotation)
         if trial_error @ trial_error < error @ error:
             q, error, boost = trial, trial_error, max(0.1 * boost, 1e-3)

@@ -192,6 +192,11 @@ class Robot:
         return cls(model, velocity=velocity, acceleration=acceleration, torque_rate=torque_rate, tip=tip)
 
     @property
+    def position_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest joint positions [rad], each (n,), as in ``limits``."""
+        return self._model.lowerPositionLimit.copy(), self._model.upperPositionLimit.copy()
+
+    @property
     def dof(self) -> int:
         """Number of joints."""
         return self._model.nv
