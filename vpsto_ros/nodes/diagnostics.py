@@ -1,14 +1,16 @@
 """What a node says about itself: statistics, counted complaints, and its status on /diagnostics."""
 
 import collections
+import contextlib
 import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -21,10 +23,19 @@ _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, D
 class Durations:
     """Percentiles of the most recent durations and the longest one ever; safe between threads."""
 
-    def __init__(self, window: int = 400) -> None:
+    def __init__(self, window: int = 20_000) -> None:
         self._recent: collections.deque[float] = collections.deque(maxlen=window)
         self.longest = 0.0
         self.count = 0
+
+    @contextlib.contextmanager
+    def measured(self) -> Iterator[None]:
+        """Record how long the block takes."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add(time.perf_counter() - begin)
 
     def add(self, seconds: float) -> None:
         """Record one duration [s]."""
@@ -113,16 +124,23 @@ class Diagnostics:
     """Publishes a node's report on /diagnostics, by a steady clock: a paused simulation still reports."""
 
     def __init__(
-        self, node: Node, report: Callable[[], Report], *, period: float = 1.0, hardware: str = ""
+        self,
+        node: Node,
+        report: Callable[[], Report],
+        *,
+        period: float = 1.0,
+        hardware: str = "",
+        stamp: Callable[[], Time] | None = None,
     ) -> None:
         self._node, self._report, self._hardware = node, report, hardware
+        self._stamp = stamp or (lambda: node.get_clock().now().to_msg())
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
         self._timer = node.create_timer(period, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self) -> None:
         """Publish the present report."""
         message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = self._stamp()
         message.status = [self.status()]
         self._publisher.publish(message)
 

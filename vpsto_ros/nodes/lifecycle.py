@@ -13,10 +13,11 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
@@ -85,6 +86,7 @@ class ManagedNode(LifecycleNode):
         self._timers_kept: list[Timer] = []
         self._subscriptions_kept: list[Any] = []
         self._publishers_kept: list[Any] = []
+        self._services_kept: list[Any] = []
         self._time_jumped = threading.Event()
         try:
             declare_parameters(self, self.default_config)
@@ -101,6 +103,13 @@ class ManagedNode(LifecycleNode):
 
     def configure(self, config: Any) -> None:
         """Build everything from the configuration; kernels are compiled here, not in the first cycle."""
+
+    def cleanup(self) -> None:
+        """Drop what `configure` made by other means than the methods below."""
+
+    def spin(self, executor: Executor) -> None:
+        """What the main thread does while the node lives."""
+        executor.spin()
 
     def stop(self) -> None:
         """Bring whatever is in motion to rest; called before the node becomes inactive."""
@@ -124,7 +133,9 @@ class ManagedNode(LifecycleNode):
         self._publishers_kept.append(publisher)
         return publisher
 
-    def subscribe(self, kind: type, topic: str, callback: Callable, qos: QoSProfile = EXTERNAL) -> None:
+    def subscribe(
+        self, kind: type, topic: str, callback: Callable, qos: QoSProfile = EXTERNAL
+    ) -> Subscription:
         """Listen to a topic; a message that the callback refuses with a VpstoError is counted and logged."""
 
         def receive(message: Any) -> None:
@@ -135,7 +146,20 @@ class ManagedNode(LifecycleNode):
             except VpstoError as error:
                 self.complaints.add(topic, f"{topic} refused: {error}")
 
-        self._subscriptions_kept.append(self.create_subscription(kind, topic, receive, qos))
+        subscription = self.create_subscription(kind, topic, receive, qos)
+        self._subscriptions_kept.append(subscription)
+        return subscription
+
+    def serve(self, kind: type, name: str, callback: Callable) -> None:
+        """Offer a service whose response has `success` and `message`; an inactive node answers that it is."""
+
+        def answer(request: Any, response: Any) -> Any:
+            if self.active:
+                return callback(request, response)
+            response.success, response.message = False, "the node is not active"
+            return response
+
+        self._services_kept.append(self.create_service(kind, name, answer))
 
     def every(self, period: float, callback: Callable[[], None], group: CallbackGroup | None = None) -> None:
         """Call back periodically in the node's time while the node is active.
@@ -173,7 +197,7 @@ class ManagedNode(LifecycleNode):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Remove what `configure` built."""
-        return self._transition(self._remove, state, super().on_cleanup)
+        return self._transition(self._clean_up, state, super().on_cleanup)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Bring everything to rest and remove it."""
@@ -220,6 +244,11 @@ class ManagedNode(LifecycleNode):
     def _shut_down(self) -> None:
         if self.active:
             self._deactivate()
+        if self.configured:
+            self._clean_up()
+
+    def _clean_up(self) -> None:
+        self.cleanup()
         self._remove()
 
     def _remove(self) -> None:
@@ -230,7 +259,9 @@ class ManagedNode(LifecycleNode):
             self.destroy_subscription(subscription)
         for publisher in self._publishers_kept:
             self.destroy_lifecycle_publisher(publisher)
-        for kept in (self._timers_kept, self._subscriptions_kept, self._publishers_kept):
+        for service in self._services_kept:
+            self.destroy_service(service)
+        for kept in (self._timers_kept, self._subscriptions_kept, self._publishers_kept, self._services_kept):
             kept.clear()
 
     def _on_jump(self, _jump: Any) -> None:
@@ -245,6 +276,15 @@ class ManagedNode(LifecycleNode):
             reason += "to change them, deactivate it, clean it up, set them, configure and activate it again"
             return SetParametersResult(successful=False, reason=reason)
         return check_change(self.default_config, parameters)
+
+
+class _Threads(MultiThreadedExecutor):
+    """Ends when its threads have: rclpy leaves them running into a node that is being destroyed."""
+
+    def shutdown(self, timeout_sec: float | None = None, **arguments: Any) -> bool:
+        done = super().shutdown(timeout_sec, **arguments)
+        self._executor.shutdown(wait=True)
+        return done
 
 
 def run(node_class: Callable[[], ManagedNode], args: list[str] | None = None) -> int:
@@ -302,12 +342,12 @@ def _create(node_class: Callable[[], ManagedNode]) -> ManagedNode | None:
 
 
 def _spin(node: ManagedNode) -> int:
-    executor = MultiThreadedExecutor(node.threads) if node.threads > 1 else SingleThreadedExecutor()
+    executor = _Threads(node.threads) if node.threads > 1 else SingleThreadedExecutor()
     executor.add_node(node)
     try:
         if node.get_parameter("autostart").value:
             node.start()
-        executor.spin()
+        node.spin(executor)
     except ConfigurationError:
         return 2  # logged by the transition that failed
     finally:

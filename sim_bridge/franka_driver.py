@@ -1,0 +1,391 @@
+"""The simulated FR3 as a ROS 2 node: what a robot's driver, its controller and a camera offer on a real one.
+
+The physics run in the main thread by simulated time; a second thread executes callbacks, which only put
+requests into a queue that the physics take between two slices. So nothing ever happens in the middle of a
+step, and no step is lost.
+"""
+
+import dataclasses
+import math
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import rclpy
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.executors import Executor
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
+
+from sim_bridge.camera import CameraConfig
+from sim_bridge.impedance import ImpedanceConfig
+from sim_bridge.pacing import Pacer, Ticker
+from sim_bridge.scene import TIMESTEP, Scene
+from sim_bridge.simulation import Simulation
+from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryCommand, TrajectoryRejected
+from vpsto_ros.configuration import option, validate
+from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.nodes import markers
+from vpsto_ros.nodes.conversions import (
+    SIMULATED,
+    observation_message,
+    require_finite,
+    require_frame,
+    state_message,
+)
+from vpsto_ros.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Report
+from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
+from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
+from vpsto_ros.nodes.scene import ShapeConfig
+
+SLICE = 0.005
+"""Simulated time between two looks at the queue [s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrankaDriverConfig(NodeConfig):
+    """Parameters of the simulated driver."""
+
+    real_time_factor: float = option(
+        1.0, "simulated seconds per real second", unit="s/s", minimum=0.01, maximum=100.0
+    )
+    seed: int = option(0, "seed of camera noise and drop-outs", minimum=0)
+    clock_rate: float = option(100.0, "rate of /clock", unit="Hz", minimum=10.0, maximum=200.0)
+    joint_state_rate: float = option(100.0, "rate of joint_states", unit="Hz", minimum=10.0, maximum=200.0)
+    report_rate: float = option(
+        50.0, "rate of external_wrench and ground truth", unit="Hz", minimum=1.0, maximum=200.0
+    )
+    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
+    disturbance_hold: float = option(
+        0.1,
+        "how long a message on disturbance acts unless a new one comes",
+        unit="s",
+        minimum=0.01,
+        maximum=5.0,
+    )
+    object: ShapeConfig = dataclasses.field(default_factory=ShapeConfig)
+    scene: Scene = dataclasses.field(default_factory=Scene)
+    camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
+    impedance: ImpedanceConfig = dataclasses.field(default_factory=ImpedanceConfig)
+    follower: FollowerConfig = dataclasses.field(default_factory=FollowerConfig)
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+    def simulation(self) -> Simulation:
+        """The scene of this configuration, at time 0."""
+        plant = dataclasses.replace(self.scene.plant, shape=self.object.shape())
+        scene = dataclasses.replace(self.scene, plant=plant)
+        return Simulation(
+            scene, seed=self.seed, camera=self.camera, impedance=self.impedance, follower=self.follower
+        )
+
+
+class FrankaDriver(ManagedNode):
+    """Steps the simulation in real time and speaks for it."""
+
+    default_config = FrankaDriverConfig()
+
+    def configure(self, config: FrankaDriverConfig) -> None:
+        """Build the simulation, warm it up, open the topics."""
+        self.config = config
+        _compile(config)
+        self.simulation = config.simulation()
+        self.pacer = Pacer(config.real_time_factor)
+        self.paused = False
+        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future]] = queue.SimpleQueue()
+        self._last_stamp = -math.inf
+        self._accepted = self._slices = 0
+        self._hand: tuple[float, NDArray] | None = None
+        self._measured = (time.perf_counter(), 0.0)
+        self._open_topics()
+        self._tickers = {
+            self._publish_joints: Ticker(config.joint_state_rate),
+            self._publish_reports: Ticker(config.report_rate),
+            self._publish_markers: Ticker(config.marker_rate),
+        }
+        self._clock_ticker = Ticker(config.clock_rate)
+        self.diagnostics = Diagnostics(self, self.report, hardware="simulated FR3", stamp=self.stamp)
+
+    def _open_topics(self) -> None:
+        self._clock_publisher = self.advertise(Clock, "/clock", best_effort(1))
+        self._joint_publisher = self.advertise(JointState, "joint_states", reliable(10))
+        self._desired_publisher = self.advertise(JointState, "desired_joint_states", reliable(5))
+        self._camera_publisher = self.advertise(PoseWithCovarianceStamped, "object_pose", reliable(5))
+        self._wrench_publisher = self.advertise(WrenchStamped, "external_wrench", reliable(5))
+        self._object_publisher = self.advertise(Odometry, "~/ground_truth/object", best_effort(1))
+        self._tool_publisher = self.advertise(Odometry, "~/ground_truth/tool", best_effort(1))
+        self._marker_publisher = self.advertise(MarkerArray, "~/markers", latched())
+        self._commands = self.subscribe(JointTrajectory, "joint_trajectory", self._receive_trajectory)
+        self.subscribe(WrenchStamped, "disturbance", self._receive_disturbance)
+        self.serve(Trigger, "~/reset", self._reset_requested)
+        self.serve(SetBool, "~/pause", self._pause_requested)
+
+    def cleanup(self) -> None:
+        """Stop reporting."""
+        self.diagnostics.destroy()
+
+    def stamp(self) -> Time:
+        """The present simulated time as a message."""
+        return SIMULATED.stamp(self.simulation.time)
+
+    # The main thread.
+
+    def spin(self, executor: Executor) -> None:
+        """Step the simulation while another thread executes callbacks."""
+        # A callback in Python may hold the interpreter for this long; the default is the length of a slice.
+        sys.setswitchinterval(1e-3)
+        failures: list[BaseException] = []
+        thread = threading.Thread(target=_spin_until_shutdown, args=(executor, failures), daemon=True)
+        thread.start()
+        running = False
+        while rclpy.ok() and thread.is_alive():
+            if not (self.active and self.configured):
+                running = False
+                time.sleep(0.02)
+                continue
+            if not running:
+                self.pacer.start(self.simulation.time)
+                running = True
+            self.advance()
+        if failures:
+            raise failures[0]
+
+    def advance(self) -> None:
+        """One slice: requests, physics, messages, and a wait until its time has come."""
+        self._serve_requests()
+        if self.paused:
+            self._clock_publisher.publish(Clock(clock=self.stamp()))
+            time.sleep(0.02)
+            self.pacer.start(self.simulation.time)
+            return
+        self._disturb()
+        self.simulation.advance(SLICE)
+        self._slices += 1
+        self._publish()
+        self.pacer.wait(self.simulation.time)
+
+    def _serve_requests(self) -> None:
+        while True:
+            try:
+                action, result = self._requests.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                result.set_result(action())
+            except InvalidInputError as error:
+                result.set_exception(error)
+
+    def _disturb(self) -> None:
+        """Push for this slice while the last message on disturbance acts."""
+        if self._hand is None:
+            return
+        end, wrench = self._hand
+        if self.simulation.time < end - 1e-9:
+            self.simulation.push_object(wrench[:3], wrench[3:], SLICE)
+        else:
+            self._hand = None
+
+    def _publish(self) -> None:
+        now = self.simulation.time
+        if self._clock_ticker.due(now):
+            self._clock_publisher.publish(Clock(clock=self.stamp()))
+        for frame in self.simulation.camera_frames():
+            stamp, base = SIMULATED.stamp(frame.stamp), self.config.base_frame
+            self._camera_publisher.publish(observation_message(frame.pose, frame.covariance, stamp, base))
+        for publish, ticker in self._tickers.items():
+            if ticker.due(now):
+                publish()
+
+    def _publish_joints(self) -> None:
+        sim, frame = self.simulation, self.config.base_frame
+        position, velocity, torque = sim.joint_position, sim.joint_velocity, sim.joint_torque
+        names = sim.robot.joint_names
+        message = joint_state_message(names, position, velocity, torque, self.stamp(), frame)
+        self._joint_publisher.publish(message)
+
+    def _publish_reports(self) -> None:
+        sim, frame, now = self.simulation, self.config.base_frame, self.simulation.time
+        position, velocity, _ = sim.follower.reference(now)
+        names, torque = sim.robot.joint_names, np.zeros(0)
+        self._desired_publisher.publish(
+            joint_state_message(names, position, velocity, torque, self.stamp(), frame)
+        )
+        wrench = WrenchStamped()
+        wrench.header.stamp, wrench.header.frame_id = self.stamp(), frame
+        force = wrench.wrench.force
+        force.x, force.y, force.z = (-sim.tool_contact_force()).tolist()
+        self._wrench_publisher.publish(wrench)
+        truth = ObjectState(now, sim.object_pose(), sim.object_twist(), np.zeros((6, 6)))
+        self._object_publisher.publish(state_message(truth, SIMULATED, frame))
+        self._tool_publisher.publish(self._tool_message())
+
+    def _tool_message(self) -> Odometry:
+        """Where the tip of the tool is and how it moves, along the axes of the base."""
+        message = Odometry(child_frame_id="fr3_tool")
+        message.header.stamp, message.header.frame_id = self.stamp(), self.config.base_frame
+        position, velocity = message.pose.pose.position, message.twist.twist.linear
+        position.x, position.y, position.z = self.simulation.tool_position().tolist()
+        velocity.x, velocity.y, velocity.z = self.simulation.tool_velocity().tolist()
+        message.pose.pose.orientation.w = 1.0
+        return message
+
+    def _publish_markers(self) -> None:
+        sim = self.simulation
+        make, plant = markers.MarkerFactory(self.config.base_frame, self.stamp()), sim.scene.plant
+        drawn = [
+            make.line("robot", markers.arm_points(sim.joint_position), markers.ROBOT, 0.03),
+            make.shape("object", plant.shape, sim.object_pose(), markers.OBJECT, plant.height),
+            make.shape("object_foot", plant.shape, sim.object_pose(), markers.OBJECT),
+        ]
+        self._marker_publisher.publish(MarkerArray(markers=drawn))
+
+    # The executor's thread.
+
+    def _ask(self, action: Callable[[], Any]) -> Future:
+        """Let the main thread do something between two slices."""
+        result: Future = Future()
+        self._requests.put((action, result))
+        return result
+
+    def _receive_trajectory(self, message: JointTrajectory) -> None:
+        try:
+            points = read_trajectory(message, SIMULATED)
+        except InvalidInputError as error:
+            raise TrajectoryRejected("shape", str(error)) from error
+        finally:
+            self._check_publishers()
+        command = TrajectoryCommand(**vars(points))
+        self._ask(lambda: self._accept(command)).add_done_callback(self._complain)
+
+    def _check_publishers(self) -> None:
+        count = self.count_publishers(self._commands.topic_name)
+        if count > 1:
+            self.complaints.add(
+                "second_planner",
+                f"{count} publishers on {self._commands.topic_name}: only one planner may command the arm; "
+                "what does not continue the running trajectory is refused",
+            )
+
+    def _accept(self, command: TrajectoryCommand) -> None:
+        now = self.simulation.time
+        start = command.stamp or now
+        if start < self._last_stamp - 1e-6:
+            raise TrajectoryRejected(
+                "order",
+                f"its stamp {start:.3f} s is before that of the running trajectory, {self._last_stamp:.3f} "
+                "s; it came late, or from a second planner",
+            )
+        self.simulation.follower.accept(command, now)
+        self._last_stamp = start
+        self._accepted += 1
+
+    def _complain(self, result: Future) -> None:
+        error = result.exception()
+        if isinstance(error, TrajectoryRejected):
+            self.complaints.add(f"joint_trajectory.{error.rule}", str(error))
+        elif error is not None:
+            self.complaints.add("joint_trajectory", str(error))
+
+    def _receive_disturbance(self, message: WrenchStamped) -> None:
+        require_frame(message.header, self.config.base_frame)
+        force, torque = message.wrench.force, message.wrench.torque
+        wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
+        require_finite("wrench", wrench)
+        if np.linalg.norm(wrench[:3]) > 200.0 or np.linalg.norm(wrench[3:]) > 20.0:
+            raise InvalidInputError("the wrench is beyond what a hand does: at most 200 N and 20 Nm")
+        self._ask(lambda: self._take_hand(wrench))
+
+    def _take_hand(self, wrench: NDArray) -> None:
+        self._hand = (self.simulation.time + self.config.disturbance_hold, wrench)
+
+    def _reset_requested(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._ask(self._reset).result(timeout=5.0)
+        response.success, response.message = True, "object and arm are back where they started; time goes on"
+        return response
+
+    def _reset(self) -> None:
+        self.simulation.reset()
+        self._hand = None
+        self._last_stamp = -math.inf
+
+    def _pause_requested(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._ask(lambda: setattr(self, "paused", request.data)).result(timeout=5.0)
+        response.success, response.message = True, "paused" if request.data else "running"
+        return response
+
+    def report(self) -> Report:
+        """The present diagnostics."""
+        sim = self.simulation
+        steps = sim.steps
+        values: dict[str, Any] = {
+            "real_time_factor": f"{self._real_time_factor():.3f}",
+            "simulated_time_s": f"{sim.time:.3f}",
+            "steps": steps,
+            "steps_lost": self._slices * round(SLICE / TIMESTEP) - steps,
+            "delayed_s": f"{self.pacer.delayed:.3f}",
+            "trajectories_accepted": self._accepted,
+            "limit_violations": self._violations(),
+            "torque_saturations": int(sim.controller.saturated.sum()),
+            "torque_rate_saturations": int(sim.controller.rate_limited.sum()),
+            "tool_height_deviation_mm": f"{1e3 * sim.tool_height_deviation:.3f}",
+        }
+        for kind, seen in sim.limits.report().items():
+            values[f"limit.{kind}.instants"] = seen.instants
+            values[f"limit.{kind}.worst"] = f"{seen.worst:.4f}"
+        values |= self.complaints.values()
+        if not self.active:
+            return Report(OK, "inactive", values)
+        if self._violations():
+            return Report(ERROR, f"limits were broken at {self._violations()} instants", values)
+        trouble = self.complaints.recent()
+        if trouble:
+            return Report(WARN, trouble, values)
+        return Report(OK, "paused" if self.paused else "running", values)
+
+    def _violations(self) -> int:
+        """Instants beyond a limit of the motion; torques asked for in excess are cut, and counted apart."""
+        seen = self.simulation.limits.report()
+        return sum(report.instants for kind, report in seen.items() if not kind.startswith("torque"))
+
+    def _real_time_factor(self) -> float:
+        """Simulated per real time since the last report."""
+        wall, simulated = self._measured
+        self._measured = (time.perf_counter(), self.simulation.time)
+        return (self._measured[1] - simulated) / max(self._measured[0] - wall, 1e-9)
+
+
+def _spin_until_shutdown(executor: Executor, failures: list[BaseException]) -> None:
+    try:
+        executor.spin()
+    except BaseException as error:  # handed to the main thread, which raises it
+        failures.append(error)
+
+
+def _compile(config: FrankaDriverConfig) -> None:
+    """Run a throw-away simulation, so that everything is compiled before time begins."""
+    simulation = config.simulation()
+    names, q = simulation.robot.joint_names, simulation.joint_position
+    still = np.tile(q, (2, 1))
+    command = TrajectoryCommand(names, 0.0, np.array([0.0, 0.1]), still, np.zeros_like(still))
+    simulation.follower.accept(command, 0.0)
+    simulation.advance(0.1)
+    simulation.tool_velocity()
+    simulation.tool_contact_force()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the simulated driver; see :func:`vpsto_ros.nodes.lifecycle.run`."""
+    return run(lambda: FrankaDriver("franka_driver"), args)

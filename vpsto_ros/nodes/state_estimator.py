@@ -1,0 +1,179 @@
+"""The node between a camera and the planners: object_pose in, object_state and object_belief out."""
+
+import dataclasses
+import math
+
+import numpy as np
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+
+from vpsto_ros.configuration import option, validate
+from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.nodes.conversions import belief_message, read_observation, state_message
+from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate, Report
+from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, reliable, run
+from vpsto_ros.nodes.scene import TableConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class StateEstimatorConfig(NodeConfig):
+    """Parameters of the state estimator."""
+
+    rate: float = option(50.0, "rate at which object_state is kept up", unit="Hz", minimum=1.0, maximum=200.0)
+    belief_rate: float = option(20.0, "rate of object_belief", unit="Hz", minimum=0.1, maximum=100.0)
+    belief_samples: int = option(50, "poses in object_belief", minimum=1, maximum=2000)
+    fresh: float = option(
+        0.15,
+        "age of the last frame up to which its state goes out as it is",
+        unit="s",
+        minimum=0.0,
+        maximum=5.0,
+    )
+    prediction: float = option(
+        0.3,
+        "time for which frames that stay away are bridged by prediction",
+        unit="s",
+        minimum=0.0,
+        maximum=5.0,
+    )
+    max_age: float = option(1.0, "older frames are refused", unit="s", minimum=0.01, maximum=60.0)
+    max_ahead: float = option(
+        0.1, "frames farther in the future are refused", unit="s", minimum=0.0, maximum=10.0
+    )
+    position_std: float = option(
+        0.005, "standard deviation of x and y where a frame gives none", unit="m", minimum=1e-5, maximum=1.0
+    )
+    yaw_std: float = option(
+        0.05, "standard deviation of yaw where a frame gives none", unit="rad", minimum=1e-5, maximum=3.0
+    )
+    seed: int = option(0, "seed of the belief's samples", minimum=0)
+    table: TableConfig = dataclasses.field(default_factory=TableConfig)
+    filter: PlanarKalmanConfig = dataclasses.field(default_factory=PlanarKalmanConfig)
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+class StateEstimator(ManagedNode):
+    """Publishes what the filter knows with every frame, and bridges drop-outs by prediction for a while."""
+
+    default_config = StateEstimatorConfig()
+
+    def configure(self, config: StateEstimatorConfig) -> None:
+        """Set up filter, topics and timers."""
+        self.config = config
+        self.filter = PlanarKalman(config.filter)
+        self.rng = np.random.default_rng(config.seed)
+        self._default_covariance = np.diag(
+            [config.position_std**2, config.position_std**2, config.yaw_std**2]
+        )
+        self._update_time, self._rate = Durations(), Rate()
+        self._warm_up()
+        self.on_time_reset()
+        self._state_publisher = self.advertise(Odometry, "object_state", reliable(1))
+        self._belief_publisher = self.advertise(PoseArray, "object_belief", best_effort(1))
+        self.subscribe(PoseWithCovarianceStamped, "object_pose", self._receive)
+        self.every(1.0 / config.rate, self._bridge)
+        self.every(1.0 / config.belief_rate, self._publish_belief)
+        self.diagnostics = Diagnostics(self, self.report)
+
+    def on_time_reset(self) -> None:
+        """Forget the object."""
+        self.filter.reset()
+        self._last_frame = -math.inf
+
+    def cleanup(self) -> None:
+        """Stop reporting."""
+        self.diagnostics.destroy()
+
+    def state(self, now: float) -> ObjectState | None:
+        """What to publish at `now` [s]: the state at the last frame, predicted if old, None if too old."""
+        state = self.filter.state
+        if state is None:
+            return None
+        ahead = now - state.stamp - self.config.fresh
+        if ahead <= 0.0:
+            return state
+        return self.filter.predict(state.stamp + ahead) if ahead <= self.config.prediction else None
+
+    def report(self) -> Report:
+        """The present diagnostics."""
+        state, now = self.filter.state, self.now()
+        age = math.inf if state is None else now - state.stamp
+        values = {
+            "rate_hz": f"{self._rate.take():.2f}",
+            "frame_age_s": f"{age:.3f}",
+            **self._update_time.milliseconds("compute"),
+            **self.complaints.values(),
+        }
+        if state is not None:
+            values["position_std_mm"] = f"{1e3 * math.sqrt(np.trace(state.covariance[:2, :2]) / 2.0):.3f}"
+        if not self.active:
+            return Report(OK, "inactive", values)
+        if state is None:
+            return Report(STALE, "no camera frame yet" + self._because(), values)
+        if age > self.config.fresh + self.config.prediction:
+            return Report(STALE, f"the camera has been silent for {age:.1f} s" + self._because(), values)
+        trouble = self.complaints.recent()
+        return Report(WARN, trouble, values) if trouble else Report(values=values)
+
+    def _because(self) -> str:
+        trouble = self.complaints.recent()
+        return f"; {trouble}" if trouble else ""
+
+    def _receive(self, message: PoseWithCovarianceStamped) -> None:
+        with self._update_time.measured():
+            reading, covariance = read_observation(message, self.config.base_frame)
+            self.config.table.check(reading)
+            now, stamp = self.now(), self.time_base.seconds(message.header.stamp)
+            self._check_stamp(stamp, now)
+            self._update(stamp, reading.pose, self._default_covariance if covariance is None else covariance)
+        self._last_frame = now
+        self._publish(now)
+
+    def _check_stamp(self, stamp: float, now: float) -> None:
+        if stamp > now + self.config.max_ahead:
+            raise InvalidInputError(
+                f"the stamp is {stamp - now:.2f} s in the future; do both sides use one clock?"
+            )
+        if stamp < now - self.config.max_age:
+            raise InvalidInputError(f"the frame is {now - stamp:.2f} s old (allowed {self.config.max_age} s)")
+
+    def _update(self, stamp: float, pose: NDArray, covariance: NDArray) -> None:
+        outcome = self.filter.update(stamp, pose, covariance)
+        if outcome.kind == "reinitialized":
+            self.get_logger().info(f"the object is somewhere else: {outcome.reason}")
+        elif outcome.kind != "accepted":
+            self.complaints.add(outcome.kind, f"frame not used, {outcome.kind}: {outcome.reason}")
+
+    def _bridge(self) -> None:
+        """Keep the state coming while frames stay away."""
+        now = self.now()
+        if now - self._last_frame >= 1.5 / self.config.rate:
+            self._publish(now)
+
+    def _publish(self, now: float) -> None:
+        state = self.state(now)
+        if state is not None:
+            self._state_publisher.publish(state_message(state, self.time_base, self.config.base_frame))
+            self._rate.tick()
+
+    def _publish_belief(self) -> None:
+        state = self.state(self.now())
+        if state is not None:
+            count, frame = self.config.belief_samples, self.config.base_frame
+            self._belief_publisher.publish(belief_message(state, count, self.rng, self.time_base, frame))
+
+    def _warm_up(self) -> None:
+        """Compile whatever the first frames would compile."""
+        for index in range(3):
+            self.filter.update(0.02 * index, np.array([0.5, 0.0, 0.0]), self._default_covariance)
+        self.filter.predict(0.2)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the state estimator; see :func:`vpsto_ros.nodes.lifecycle.run`."""
+    return run(lambda: StateEstimator("state_estimator"), args)
