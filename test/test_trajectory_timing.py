@@ -143,6 +143,16 @@ def test_constant_speed_at_the_limit():
         assert minimal_duration(basis, -keys, [-2.0], [-2.0], limits) == pytest.approx(1.5, rel=1e-12)
 
 
+def test_both_ends_on_the_limit_and_the_way_backwards():
+    # Symmetric up to round-off: the worst instant is the middle, at |q̇| = 3 distance / T - v / 2.
+    limits, basis = Limits([1.9552193], [1e6]), OptimalBasis.uniform(0)
+    for start in (1.9552193, np.nextafter(1.9552193, 0)):
+        for end in (1.9552193, np.nextafter(1.9552193, 0), 1.9552193 * (1 - 1e-13)):
+            for keys in ([[0.0], [-0.3]], [[0.0385], [0.0328]], [[1.0], [0.9]]):
+                duration = minimal_duration(basis, keys, [start], [end], limits)
+                assert duration == pytest.approx(3 * (keys[0][0] - keys[1][0]) / 1.9552193, rel=1e-9)
+
+
 def test_known_durations_from_rest_to_rest():
     # N = 0 from rest: q' peaks at 1.5, q'' at 6 per unit distance.
     basis, keys = OptimalBasis.uniform(0), np.array([[0.0], [0.8]])

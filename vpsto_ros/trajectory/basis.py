@@ -135,7 +135,7 @@ def _knot_slopes(knots: NDArray[np.float64]) -> NDArray[np.float64]:
     for i in range(1, size - 1):
         left[i, i - 1 : i + 2] = g[i - 1], 2.0 * (g[i - 1] + g[i]), g[i]
         right[i, i - 1 : i + 2] = -3.0 * g[i - 1] ** 2, 3.0 * (g[i - 1] ** 2 - g[i] ** 2), 3.0 * g[i] ** 2
-    slopes: NDArray[np.float64] = np.linalg.solve(left, right)
+    slopes = np.asarray(np.linalg.solve(left, right), dtype=np.float64)
     # The end slopes are given numbers: no round-off of the solver may leak into them.
     slopes[[0, -1]] = right[[0, -1]]
     return slopes

@@ -132,8 +132,9 @@ def _minimal_duration(knots, keys, start, end, alpha, beta, velocity, accelerati
             if i == last:
                 duration = _end_bound(duration, h, a1, a0, c, b1, b0, velocity[j], acceleration[j])
     # A second pass: the tests for the inside of a segment need its two ends to be feasible. Near an end on
-    # the limit alpha and limit - beta both vanish, so u counts from that end, from both in a lone segment.
-    reach = 0.5 if last == 0 else 1.0
+    # the limit alpha and limit - beta both vanish, so u counts from that end. A lone segment is searched from
+    # both, overlapping, lest round-off drops a maximum in the middle.
+    reach = 0.75 if last == 0 else 1.0
     for i in range(last + 1):
         h = knots[i + 1] - knots[i]
         for j in range(dof):
