@@ -63,6 +63,13 @@ def test_agrees_with_the_batch(seed):
         np.testing.assert_allclose(trajectory(t, order), samples[0], atol=1e-9)
 
 
+def test_takes_a_row_of_a_batch_as_velocity():
+    basis, keys, start, end = random_problem(10)
+    expected = synthesize(basis, keys, start, end, LIMITS)
+    trajectory = synthesize(basis, keys, start[None], list(end), LIMITS)
+    np.testing.assert_array_equal(trajectory.coefficients, expected.coefficients)
+
+
 def test_longer_durations_are_fine_and_shorter_ones_refused():
     basis, keys, start, end = random_problem(6)
     shortest = minimal_duration(basis, keys, start, end, LIMITS)

@@ -39,6 +39,7 @@ def synthesize(
     keys = np.array(key_positions, dtype=np.float64)
     if keys.ndim != 2:
         raise InvalidInputError(f"key positions must have shape (N + 2, n), got {keys.shape}")
+    start_velocity, end_velocity = np.ravel(start_velocity), np.ravel(end_velocity)
     shortest = minimal_duration(basis, keys, start_velocity, end_velocity, limits)
     if not np.isfinite(shortest):
         raise InfeasibleError(_beyond_limit(start_velocity, end_velocity, limits))
