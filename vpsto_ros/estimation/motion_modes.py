@@ -175,7 +175,7 @@ def _moments(
     mean = weights @ means
     off = means - mean
     covariance = (weights[:, None, None] * covariances).sum(axis=0) + (off.T * weights) @ off
-    return mean, covariance
+    return mean, _symmetric(covariance)
 
 
 def _symmetric(matrices: np.ndarray) -> np.ndarray:

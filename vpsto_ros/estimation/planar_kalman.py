@@ -12,11 +12,11 @@ import math
 import numpy as np
 
 from vpsto_ros.configuration import option, validate
-from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes, wrapped
+from vpsto_ros.estimation.motion_modes import Innovation, ModeBelief, MotionModes, wrapped
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
-_FARTHEST = 1e3  # no pose of a table-top object has a coordinate beyond this [m, rad]
+_FARTHEST = 1e3  # no object on a table is farther away [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class PlanarKalmanConfig:
         (0.8, 8.0), "change of velocity while accelerated", unit="m/s, rad/s per sqrt(s)", minimum=1e-6
     )
     dwell: tuple[float, float, float] = option(
-        (0.5, 0.5, 0.15), "mean time at rest, steady and accelerated", unit="s", minimum=1e-3
+        (0.5, 2.0, 0.15), "mean time at rest, steady and accelerated", unit="s", minimum=1e-3
     )
     gate: float = option(
         30.0, "squared Mahalanobis distance beyond which a pose is an outlier", minimum=1.0, maximum=1e6
@@ -124,7 +124,7 @@ class PlanarKalman:
         self._belief: ModeBelief | None = None
         self._stamp = -math.inf
         self._pending: list[_Measurement] = []
-        self.normalized_innovation = math.nan
+        self._surprise: tuple[Innovation, np.ndarray] | None = None
 
     @property
     def state(self) -> ObjectState | None:
@@ -135,6 +135,15 @@ class PlanarKalman:
     def mode_probabilities(self) -> np.ndarray | None:
         """Probability of rest, steady motion and acceleration, shape (3,), None before the first pose."""
         return None if self._belief is None else self._belief.probability
+
+    @property
+    def normalized_innovation(self) -> float:
+        """Squared Mahalanobis distance of the last pose that was compared to its prediction, NaN before.
+
+        Averages to 3 when noise and modes are as configured; much more means that the camera's covariance is
+        too small.
+        """
+        return math.nan if self._surprise is None else self._surprise[0].normalized(self._surprise[1])
 
     def predict(self, stamp: float) -> ObjectState | None:
         """State at `stamp` [s], None before the first pose.
@@ -188,7 +197,7 @@ class PlanarKalman:
     def _correct(self, belief: ModeBelief, measurement: _Measurement, gap: float) -> Outcome:
         predicted = belief.mixed(self._modes, gap).propagated(self._modes, gap)
         innovation = predicted.innovation(measurement.pose, measurement.covariance)
-        self.normalized_innovation = innovation.normalized(predicted.probability)
+        self._surprise = innovation, predicted.probability
         distance = float(innovation.distance.min())
         if not distance <= self.config.gate:
             reason = f"squared Mahalanobis distance {distance:.3g} > {self.config.gate:g}"
@@ -217,7 +226,7 @@ class PlanarKalman:
         noise = first.covariance + second.covariance
         reach = self.config.max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
         turn = self.config.max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
-        return math.hypot(step[0], step[1]) <= reach and bool(abs(wrapped(step[2])) <= turn)
+        return math.hypot(step[0], step[1]) <= reach and abs(wrapped(step[2])) <= turn
 
     def _restart(self, measurements: list[_Measurement]) -> None:
         """Begin at the first measurement and replay the others, so that the twist is known as well."""
@@ -269,8 +278,9 @@ def _checked(stamp: float, pose: np.ndarray, covariance: np.ndarray) -> tuple[st
         return f"expected pose (3,) and covariance (3, 3), got {where.shape} and {noise.shape}", None
     if not (math.isfinite(time) and np.isfinite(where).all() and np.isfinite(noise).all()):
         return "stamp, pose or covariance is not finite", None
-    if np.abs(where).max() > _FARTHEST:
-        return f"pose {where} is beyond {_FARTHEST:g} m or rad", None
+    if np.abs(where[:2]).max() > _FARTHEST:
+        return f"position {where[:2]} is beyond {_FARTHEST:g} m", None
+    where[2] = wrapped(where[2])
     if np.abs(noise - noise.T).max() > 1e-6 * np.abs(noise).max():
         return "covariance is not symmetric", None
     try:

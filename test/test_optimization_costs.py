@@ -1,0 +1,206 @@
+"""Cost terms against fine sampling and SciPy, and VP-STO from end to end."""
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.interpolate import CubicSpline
+
+from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, InvalidInputError
+from vpsto_ros.optimization.costs import (
+    CostWeights,
+    JointSpaceProblem,
+    collision_cost,
+    duration_cost,
+    joint_limit_cost,
+    position_extrema,
+    pushing_progress_cost,
+    smoothness_cost,
+)
+from vpsto_ros.optimization.vpsto import VpstoConfig, search
+from vpsto_ros.trajectory import Limits, OptimalBasis, minimal_duration, synthesize, synthesize_batch
+
+LIMITS = Limits(np.array([1.0, 0.8]), np.array([2.0, 3.0]), np.array([-0.6, -0.5]), np.array([1.2, 0.9]))
+V0, VT = np.array([0.4, -0.3]), np.array([0.1, 0.5])
+
+
+@pytest.fixture
+def basis():
+    return OptimalBasis.uniform(3)
+
+
+@pytest.fixture
+def batch(basis):
+    keys = np.random.default_rng(2).uniform(-0.6, 1.0, (40, 5, 2))
+    return synthesize_batch(basis, keys, V0, VT, LIMITS, 60)
+
+
+def test_durations_are_costs(batch):
+    np.testing.assert_array_equal(duration_cost(batch), batch.duration)
+
+
+def test_smoothness_is_the_exact_effort(basis, batch):
+    weights = np.array([2.0, 0.5])
+    cost = smoothness_cost(basis, batch, V0, VT, weights)
+    s = np.linspace(0, 1, 20_001)
+    for keys, duration, value in zip(batch.key_positions, batch.duration, cost, strict=True):
+        spline = CubicSpline(basis.knots, keys, bc_type=((1, V0 * duration), (1, VT * duration)))
+        assert value == pytest.approx(0.5 * trapezoid(spline(s, 2) ** 2 @ weights, s), rel=1e-5)
+
+
+def test_smoothness_does_not_depend_on_the_origin(basis, batch):
+    moved = synthesize_batch(basis, batch.key_positions + 1e4, V0, VT, LIMITS, 2)
+    np.testing.assert_allclose(
+        smoothness_cost(basis, moved, V0, VT), smoothness_cost(basis, batch, V0, VT), rtol=1e-6
+    )
+
+
+def test_extrema_are_those_of_the_one_evaluator(basis, batch):
+    lowest, highest = position_extrema(basis, batch, V0, VT)
+    for b, keys in enumerate(batch.key_positions):
+        lower, upper = synthesize(basis, keys, V0, VT, LIMITS).extrema(0)
+        np.testing.assert_allclose(lowest[b], lower, atol=1e-12)
+        np.testing.assert_allclose(highest[b], upper, atol=1e-12)
+    assert np.all(batch.position.max(axis=1) <= highest + 1e-12)
+
+
+def test_joint_limits_are_exact(basis, batch):
+    cost, valid = joint_limit_cost(basis, batch, V0, VT, LIMITS)
+    assert 0 < np.count_nonzero(valid) < len(valid)
+    for b, keys in enumerate(batch.key_positions):
+        broken = synthesize(basis, keys, V0, VT, LIMITS).violations(LIMITS)
+        assert valid[b] == (not broken)
+        assert valid[b] == (cost[b] == 0)
+        assert cost[b] >= len(broken)
+
+
+def test_joint_limit_cost_is_one_plus_the_excess(basis):
+    keys = np.zeros((1, 5, 2))
+    keys[0, 1:, 0] = 1.5  # overshoots the end position, whose excess alone would be 0.3
+    batch = synthesize_batch(basis, keys, np.zeros(2), np.zeros(2), LIMITS, 10)
+    _, highest = position_extrema(basis, batch, np.zeros(2), np.zeros(2))
+    cost, valid = joint_limit_cost(basis, batch, np.zeros(2), np.zeros(2), LIMITS)
+    assert not valid[0] and cost[0] == pytest.approx(1.0 + highest[0, 0] - 1.2)
+
+
+def test_collisions_are_counted(batch):
+    count, valid = collision_cost(batch, lambda q: q[..., 0] > 0.8)
+    np.testing.assert_array_equal(count, (batch.position[..., 0] > 0.8).sum(axis=1))
+    np.testing.assert_array_equal(valid, count == 0)
+    with pytest.raises(InvalidInputError, match=r"bool of shape \(40, 60\)"):
+        collision_cost(batch, lambda q: q > 0.8)
+
+
+def test_pushing_progress():
+    target = np.array([1.0, 0.0])
+    end = np.array([[0.5, 0.0], [0.0, 0.0], [-0.5, 0.0]])
+    cost, valid = pushing_progress_cost(np.zeros(2), end, target)
+    np.testing.assert_allclose(cost, np.exp([0.25 - 1, 0.0, 2.25 - 1]))
+    np.testing.assert_array_equal(valid, [True, False, False])
+
+
+def disc(positions):
+    return np.square(positions - [0.5, 0.0]).sum(axis=-1) < 0.3**2
+
+
+PLANE = Limits(np.full(2, 1.0), np.full(2, 2.0), np.full(2, -0.6), np.full(2, 1.2))
+
+
+def around_the_disc(n_via=3, **options):
+    arguments = {"goal": np.array([1.0, 0.0]), "collision": disc} | options
+    return JointSpaceProblem(OptimalBasis.uniform(n_via), PLANE, np.zeros(2), **arguments)
+
+
+@pytest.mark.parametrize("strategy", ["sep-cma", "cma"])
+def test_a_way_round_the_obstacle_is_found_every_time(strategy):
+    problem = around_the_disc()
+    sides = set()
+    for seed in range(20):
+        config = VpstoConfig(strategy=strategy, iterations=15)
+        result = search(problem.prior(spread=0.3), problem.evaluate, config, np.random.default_rng(seed))
+        assert result.valid, f"seed {seed}: {result.status}"
+        trajectory = problem.trajectory(result.points)
+        assert trajectory.violations(PLANE) == []
+        fine = trajectory(np.linspace(0, trajectory.duration, 2000))
+        assert np.linalg.norm(fine - [0.5, 0.0], axis=1).min() > 0.3 - 0.005, "between two samples at most"
+        assert result.cost < 3.5
+        sides.add(bool(trajectory(trajectory.duration / 2)[1] > 0))
+    assert sides == {True, False}, "both ways round are found"
+
+
+def test_all_seeds_converge_to_one_of_two_mirrored_optima():
+    problem = around_the_disc()
+    costs = []
+    for seed in range(6):
+        config = VpstoConfig(strategy="cma", iterations=100)
+        costs.append(
+            search(problem.prior(spread=0.3), problem.evaluate, config, np.random.default_rng(seed)).cost
+        )
+    np.testing.assert_allclose(costs, np.min(costs), rtol=5e-3)
+
+
+def test_more_via_points_approach_the_bang_bang_time():
+    # Thesis 4.5.3: from 0 to 1 with |v| <= 0.1 and |a| <= 0.2 takes at least 10.5 s.
+    limits = Limits(np.array([0.1]), np.array([0.2]))
+    best = []
+    for n_via in (1, 3, 6):
+        problem = JointSpaceProblem(
+            OptimalBasis.uniform(n_via), limits, np.zeros(1), np.ones(1), weights=CostWeights(smoothness=0.0)
+        )
+        config = VpstoConfig(strategy="cma", iterations=120)
+        best.append(
+            search(problem.prior(spread=0.2), problem.evaluate, config, np.random.default_rng(0)).cost
+        )
+    assert best[0] > best[1] > best[2] > 10.5
+    assert best[2] < 11.2
+
+
+def test_a_free_goal_is_part_of_the_search():
+    def to_the_right(batch):
+        cost = 10 * np.abs(batch.position[:, -1, 0] - 0.7)
+        return cost, np.ones(len(cost), dtype=bool)
+
+    problem = around_the_disc(2, goal=None, collision=None, terms=(to_the_right,))
+    config = VpstoConfig(iterations=60)
+    result = search(problem.prior(spread=0.3), problem.evaluate, config, np.random.default_rng(0))
+    assert result.points.shape == (3, 2)
+    assert problem.trajectory(result.points)(100.0)[0] == pytest.approx(0.7, abs=0.01)
+
+
+def test_seven_joints_through_a_narrow_gap():
+    limits = Limits(np.full(7, 2.0), np.full(7, 8.0), np.full(7, -2.0), np.full(7, 2.0))
+
+    def wall(q):
+        return (np.abs(q[..., 0] - 0.5) < 0.1) & (q[..., 1] < 0.5)
+
+    goal = np.zeros(7)
+    goal[0] = 1.0
+    problem = JointSpaceProblem(OptimalBasis.uniform(4), limits, np.zeros(7), goal, collision=wall)
+    config = VpstoConfig(iterations=60)
+    result = search(problem.prior(spread=0.4), problem.evaluate, config, np.random.default_rng(0))
+    assert result.valid and problem.trajectory(result.points).violations(limits) == []
+
+
+def test_a_start_faster_than_the_limit_has_no_valid_plan():
+    problem = around_the_disc(start_velocity=np.array([1.5, 0.0]))
+    result = search(problem.prior(spread=0.3), problem.evaluate, VpstoConfig(), np.random.default_rng(0))
+    assert result.status == "no valid plan" and result.non_finite == result.evaluations
+    with pytest.raises(InfeasibleError):
+        problem.trajectory(np.zeros((3, 2)))
+
+
+def test_the_prior_uses_the_duration_of_the_direct_motion():
+    velocity = np.array([0.5, 0.0])
+    problem = around_the_disc(start_velocity=velocity)
+    ends = np.array([[0.0, 0.0], [1.0, 0.0]])
+    duration = minimal_duration(OptimalBasis.uniform(0), ends, velocity, np.zeros(2), PLANE)
+    curve = CubicSpline([0, 1], ends, bc_type=((1, velocity * duration), (1, np.zeros(2))))
+    np.testing.assert_allclose(problem.prior().mean_points, curve([0.25, 0.5, 0.75]), atol=1e-12)
+
+
+def test_errors_name_what_is_wrong():
+    with pytest.raises(InvalidInputError, match=r"goal must be finite with shape \(2,\)"):
+        around_the_disc(goal=np.zeros(3))
+    with pytest.raises(InvalidInputError, match=r"points of shape \(B, 3, 2\), got \(5, 2, 2\)"):
+        around_the_disc().evaluate(np.zeros((5, 2, 2)))
+    with pytest.raises(ConfigurationError, match=r"CostWeights\.collision = -1"):
+        CostWeights(collision=-1.0)
