@@ -81,8 +81,17 @@ class LimitMonitor:
 
     @property
     def violations(self) -> int:
-        """Instants beyond a limit, summed over kinds."""
-        return int(self._counts.sum())
+        """Instants beyond a limit of position, velocity, acceleration or torque, summed over kinds.
+
+        Torque-rate cuts do not count: the controller ramps the torque, which is then within its limits, whenever the
+        reference's acceleration steps; see :attr:`ramped`.
+        """
+        return int(self._counts[: KINDS.index("torque_rate")].sum())
+
+    @property
+    def ramped(self) -> int:
+        """Instants at which the controller cut the rate of a torque."""
+        return int(self._counts[KINDS.index("torque_rate")])
 
 
 @njit(cache=True, nogil=True)

@@ -49,6 +49,7 @@ class Workspace:
     radius_max: float = option(0.76, "largest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
     side: float = option(0.45, "the tool stays within +- side in y", unit="m", minimum=0.0, maximum=2.0)
     object_x: tuple[float, float] = option((0.40, 0.64), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0)
+    margin: float = option(0.02, "distance from the border that plans keep for objects that need not come nearer", unit="m", minimum=0.0, maximum=0.2)
     object_y: tuple[float, float] = option((-0.32, 0.32), "range of the object's origin in y", unit="m", minimum=-2.0, maximum=2.0)
 
     def __post_init__(self) -> None:
@@ -61,10 +62,10 @@ class Workspace:
         behind = 0.1 - path[..., 0]
         return np.maximum(np.maximum(beyond, behind).max(axis=1), 0.0)
 
-    def object_excess(self, poses: NDArray) -> NDArray:
-        """How far object paths (..., K, 3) leave their region, shape (...) [m]; 0 inside."""
-        low = np.array([self.object_x[0], self.object_y[0]])
-        high = np.array([self.object_x[1], self.object_y[1]])
+    def object_excess(self, poses: NDArray, margin: float = 0.0) -> NDArray:
+        """How far object paths (..., K, 3) leave their region less a margin [m], shape (...) [m]; 0 inside."""
+        low = np.array([self.object_x[0], self.object_y[0]]) + margin
+        high = np.array([self.object_x[1], self.object_y[1]]) - margin
         beyond = np.maximum(low - poses[..., :2], poses[..., :2] - high)
         return np.maximum(beyond.max(axis=(-2, -1)), 0.0)
 
@@ -135,6 +136,9 @@ class PushingProblem:
         self.tool_offset, self.pose, self.goal = tool_offset, pose, goal
         self.contact, self.pushes = contact, pushes
         self.start_error = float(goal.error(pose, model.pressure_radius))
+        # An object that is near or beyond the border must be allowed to come back, and to go to a goal that is there.
+        ends = np.stack([pose, np.append(goal.position, 0.0)])[:, None]
+        self._allowed_excess = float(workspace.object_excess(ends, workspace.margin).max()) + 1e-3
         self._fixed_end = pose[:2] if costs.end_point == "object" else None
 
     def evaluate(self, points: NDArray) -> Evaluation:
@@ -163,10 +167,8 @@ class PushingProblem:
         poses = self._rollouts(motion.position + self.tool_offset)
         error = self.goal.error(poses[:, :, -1], self.model.pressure_radius).mean(axis=0)
         rotation = np.abs(poses[:, :, -1, 2] - self.pose[2]).mean(axis=0)
-        leaves = self.workspace.object_excess(poses).max(axis=0)
-        # An object that is outside already must be allowed to come back: count only what makes it worse.
-        already = float(self.workspace.object_excess(self.pose[None]))
-        excess = np.maximum(self.workspace.tool_excess(motion.position), np.maximum(leaves - already - 1e-3, 0.0))
+        leaves = self.workspace.object_excess(poses, self.workspace.margin).max(axis=0)
+        excess = np.maximum(self.workspace.tool_excess(motion.position), np.maximum(leaves - self._allowed_excess, 0.0))
         return PushOutcome(motion, poses[len(poses) // 2], error, rotation, excess)
 
     def trajectory(self, points: NDArray) -> Trajectory:
