@@ -28,6 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from sim_bridge import driver_messages as messages
 from sim_bridge.camera import CameraConfig
 from sim_bridge.impedance import ImpedanceConfig
 from sim_bridge.pacing import Pacer, Ticker
@@ -35,18 +36,15 @@ from sim_bridge.scene import TIMESTEP, Scene
 from sim_bridge.simulation import Simulation
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryCommand, TrajectoryRejected
 from vpsto_ros.configuration import option, validate
-from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import (
     SIMULATED,
     observation_message,
     require_finite,
     require_frame,
-    state_message,
 )
 from vpsto_ros.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Report
-from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
+from vpsto_ros.nodes.joint_conversions import read_trajectory
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
 from vpsto_ros.nodes.scene import ShapeConfig
 
@@ -210,47 +208,17 @@ class FrankaDriver(ManagedNode):
                 publish()
 
     def _publish_joints(self) -> None:
-        sim, frame = self.simulation, self.config.base_frame
-        position, velocity, torque = sim.joint_position, sim.joint_velocity, sim.joint_torque
-        names = sim.robot.joint_names
-        message = joint_state_message(names, position, velocity, torque, self.stamp(), frame)
-        self._joint_publisher.publish(message)
+        self._joint_publisher.publish(messages.measured_joints(self.simulation, self.config.base_frame))
 
     def _publish_reports(self) -> None:
-        sim, frame, now = self.simulation, self.config.base_frame, self.simulation.time
-        position, velocity, _ = sim.follower.reference(now)
-        names, torque = sim.robot.joint_names, np.zeros(0)
-        self._desired_publisher.publish(
-            joint_state_message(names, position, velocity, torque, self.stamp(), frame)
-        )
-        wrench = WrenchStamped()
-        wrench.header.stamp, wrench.header.frame_id = self.stamp(), frame
-        force = wrench.wrench.force
-        force.x, force.y, force.z = (-sim.tool_contact_force()).tolist()
-        self._wrench_publisher.publish(wrench)
-        truth = ObjectState(now, sim.object_pose(), sim.object_twist(), np.zeros((6, 6)))
-        self._object_publisher.publish(state_message(truth, SIMULATED, frame))
-        self._tool_publisher.publish(self._tool_message())
-
-    def _tool_message(self) -> Odometry:
-        """Where the tip of the tool is and how it moves, along the axes of the base."""
-        message = Odometry(child_frame_id="fr3_tool")
-        message.header.stamp, message.header.frame_id = self.stamp(), self.config.base_frame
-        position, velocity = message.pose.pose.position, message.twist.twist.linear
-        position.x, position.y, position.z = self.simulation.tool_position().tolist()
-        velocity.x, velocity.y, velocity.z = self.simulation.tool_velocity().tolist()
-        message.pose.pose.orientation.w = 1.0
-        return message
+        sim, frame = self.simulation, self.config.base_frame
+        self._desired_publisher.publish(messages.desired_joints(sim, frame))
+        self._wrench_publisher.publish(messages.external_wrench(sim, frame))
+        self._object_publisher.publish(messages.true_object(sim, frame))
+        self._tool_publisher.publish(messages.true_tool(sim, frame))
 
     def _publish_markers(self) -> None:
-        sim = self.simulation
-        make, plant = markers.MarkerFactory(self.config.base_frame, self.stamp()), sim.scene.plant
-        drawn = [
-            make.line("robot", markers.arm_points(sim.joint_position), markers.ROBOT, 0.03),
-            make.shape("object", plant.shape, sim.object_pose(), markers.OBJECT, plant.height),
-            make.shape("object_foot", plant.shape, sim.object_pose(), markers.OBJECT),
-        ]
-        self._marker_publisher.publish(MarkerArray(markers=drawn))
+        self._marker_publisher.publish(messages.scene_markers(self.simulation, self.config.base_frame))
 
     # The executor's thread.
 
@@ -265,8 +233,6 @@ class FrankaDriver(ManagedNode):
             points = read_trajectory(message, SIMULATED)
         except InvalidInputError as error:
             raise TrajectoryRejected("shape", str(error)) from error
-        finally:
-            self._check_publishers()
         command = TrajectoryCommand(**vars(points))
         self._ask(lambda: self._accept(command)).add_done_callback(self._complain)
 
@@ -328,37 +294,25 @@ class FrankaDriver(ManagedNode):
 
     def report(self) -> Report:
         """The present diagnostics."""
+        self._check_publishers()
         sim = self.simulation
-        steps = sim.steps
         values: dict[str, Any] = {
             "real_time_factor": f"{self._real_time_factor():.3f}",
-            "simulated_time_s": f"{sim.time:.3f}",
-            "steps": steps,
-            "steps_lost": self._slices * round(SLICE / TIMESTEP) - steps,
+            "steps_lost": self._slices * round(SLICE / TIMESTEP) - sim.steps,
             "delayed_s": f"{self.pacer.delayed:.3f}",
             "trajectories_accepted": self._accepted,
-            "limit_violations": self._violations(),
-            "torque_saturations": int(sim.controller.saturated.sum()),
-            "torque_rate_saturations": int(sim.controller.rate_limited.sum()),
-            "tool_height_deviation_mm": f"{1e3 * sim.tool_height_deviation:.3f}",
+            **messages.figures(sim),
         }
-        for kind, seen in sim.limits.report().items():
-            values[f"limit.{kind}.instants"] = seen.instants
-            values[f"limit.{kind}.worst"] = f"{seen.worst:.4f}"
         values |= self.complaints.values()
         if not self.active:
             return Report(OK, "inactive", values)
-        if self._violations():
-            return Report(ERROR, f"limits were broken at {self._violations()} instants", values)
+        violations = messages.limit_violations(sim)
+        if violations:
+            return Report(ERROR, f"limits were broken at {violations} instants", values)
         trouble = self.complaints.recent()
         if trouble:
             return Report(WARN, trouble, values)
         return Report(OK, "paused" if self.paused else "running", values)
-
-    def _violations(self) -> int:
-        """Instants beyond a limit of the motion; torques asked for in excess are cut, and counted apart."""
-        seen = self.simulation.limits.report()
-        return sum(report.instants for kind, report in seen.items() if not kind.startswith("torque"))
 
     def _real_time_factor(self) -> float:
         """Simulated per real time since the last report."""

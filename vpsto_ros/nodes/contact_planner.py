@@ -8,15 +8,17 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import contact_message, read_state
 from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate, Report
 from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, latched, run
 from vpsto_ros.nodes.scene import ModelConfig, goal_on_table
-from vpsto_ros.planning.contact import ContactPlannerConfig, PushContactPlanner
+from vpsto_ros.planning.contact import ContactPlan, ContactPlannerConfig, PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushing_problem import Workspace
 from vpsto_ros.robot.kinematics import JOINT_NAMES, forward_kinematics_batch
@@ -27,6 +29,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     """Parameters of the contact planner."""
 
     rate: float = option(20.0, "planning rate", unit="Hz", minimum=0.5, maximum=100.0)
+    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
     goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
     tool_frame: str = option("fr3_tool", "child_frame_id of contact_plan: what shall touch")
     input_timeout: float = option(
@@ -54,10 +57,12 @@ class ContactPlannerNode(ManagedNode):
         self._compute, self._rate, self._status = Durations(), Rate(), Report(STALE, "waiting")
         self._warm_up()
         self._publisher = self.advertise(Odometry, "contact_plan", latched())
+        self._marker_publisher = self.advertise(MarkerArray, "~/markers", latched())
         self.subscribe(JointState, "joint_states", self._receive_joints)
         self.subscribe(Odometry, "object_state", self._receive_object)
         self.subscribe(PoseStamped, "goal_pose", self._receive_goal)
         self.every(1.0 / config.rate, self.plan)
+        self.every(1.0 / config.marker_rate, self._publish_markers)
         self.diagnostics = Diagnostics(self, self.report)
 
     def on_time_reset(self) -> None:
@@ -65,6 +70,7 @@ class ContactPlannerNode(ManagedNode):
         self.tool: NDArray | None = None
         self.tool_stamp = -math.inf
         self.object: ObjectState | None = None
+        self.last: ContactPlan | None = None
 
     def cleanup(self) -> None:
         """Stop reporting."""
@@ -81,6 +87,7 @@ class ContactPlannerNode(ManagedNode):
             plan = self.planner.plan(now, self.tool, self.object, self.goal)
         message = contact_message(plan, self.time_base, self.config.base_frame, self.config.tool_frame)
         self._publisher.publish(message)
+        self.last = plan
         self._rate.tick()
         self._status = Report()
 
@@ -106,6 +113,16 @@ class ContactPlannerNode(ManagedNode):
         if self.object is None or now - self.object.stamp > limit:
             return f"no object_state within {limit} s"
         return "no goal_pose yet" if self.goal is None else ""
+
+    def _publish_markers(self) -> None:
+        if self.last is None:
+            return
+        make, plan = markers.MarkerFactory(self.config.base_frame, self.get_clock().now().to_msg()), self.last
+        drawn = [
+            make.spheres("touch", plan.position[None], markers.PLAN, 0.012),
+            make.line("push", plan.position + 0.2 * np.outer((0.0, 1.0), plan.velocity), markers.PLAN),
+        ]
+        self._marker_publisher.publish(MarkerArray(markers=drawn))
 
     def _receive_joints(self, message: JointState) -> None:
         position, _ = read_joint_state(message, JOINT_NAMES)

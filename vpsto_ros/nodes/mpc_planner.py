@@ -359,8 +359,6 @@ class MpcPlannerNode(ManagedNode):
             drawn.append(make.shape("goal", shape, pose, markers.GOAL))
         if self.joints is not None:
             drawn.append(make.line("robot", markers.arm_points(self.joints.position), markers.ROBOT, 0.03))
-        if self.contact is not None:
-            drawn.append(make.spheres("contact_plan", self.contact[1].position[None], markers.PLAN, 0.012))
         self._marker_publisher.publish(MarkerArray(markers=drawn))
 
     def _now(self) -> float:

@@ -7,14 +7,16 @@ import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from visualization_msgs.msg import MarkerArray
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
 from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import belief_message, read_observation, state_message
 from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate, Report
-from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, reliable, run
+from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
 from vpsto_ros.nodes.scene import TableConfig
 
 
@@ -24,6 +26,7 @@ class StateEstimatorConfig(NodeConfig):
 
     rate: float = option(50.0, "rate at which object_state is kept up", unit="Hz", minimum=1.0, maximum=200.0)
     belief_rate: float = option(20.0, "rate of object_belief", unit="Hz", minimum=0.1, maximum=100.0)
+    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
     belief_samples: int = option(50, "poses in object_belief", minimum=1, maximum=2000)
     fresh: float = option(
         0.15,
@@ -75,14 +78,17 @@ class StateEstimator(ManagedNode):
         self.on_time_reset()
         self._state_publisher = self.advertise(Odometry, "object_state", reliable(1))
         self._belief_publisher = self.advertise(PoseArray, "object_belief", best_effort(1))
+        self._marker_publisher = self.advertise(MarkerArray, "~/markers", latched())
         self.subscribe(PoseWithCovarianceStamped, "object_pose", self._receive)
         self.every(1.0 / config.rate, self._bridge)
         self.every(1.0 / config.belief_rate, self._publish_belief)
+        self.every(1.0 / config.marker_rate, self._publish_markers)
         self.diagnostics = Diagnostics(self, self.report)
 
     def on_time_reset(self) -> None:
         """Forget the object."""
         self.filter.reset()
+        self._belief = PoseArray()
         self._last_frame = -math.inf
 
     def cleanup(self) -> None:
@@ -165,7 +171,14 @@ class StateEstimator(ManagedNode):
         state = self.state(self.now())
         if state is not None:
             count, frame = self.config.belief_samples, self.config.base_frame
-            self._belief_publisher.publish(belief_message(state, count, self.rng, self.time_base, frame))
+            self._belief = belief_message(state, count, self.rng, self.time_base, frame)
+            self._belief_publisher.publish(self._belief)
+
+    def _publish_markers(self) -> None:
+        make = markers.MarkerFactory(self.config.base_frame, self.get_clock().now().to_msg())
+        points = np.array([[pose.position.x, pose.position.y] for pose in self._belief.poses]).reshape(-1, 2)
+        drawn = [make.spheres("object_belief", points, markers.ESTIMATE)]
+        self._marker_publisher.publish(MarkerArray(markers=drawn))
 
     def _warm_up(self) -> None:
         """Compile whatever the first frames would compile."""

@@ -1,0 +1,92 @@
+"""What the simulated driver publishes, made from the simulation."""
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
+
+from sim_bridge.simulation import Simulation
+from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.nodes import markers
+from vpsto_ros.nodes.conversions import SIMULATED, state_message
+from vpsto_ros.nodes.joint_conversions import joint_state_message
+
+
+def measured_joints(simulation: Simulation, frame: str) -> JointState:
+    """Measured positions, velocities and torques."""
+    position, velocity = simulation.joint_position, simulation.joint_velocity
+    names, stamp = simulation.robot.joint_names, SIMULATED.stamp(simulation.time)
+    return joint_state_message(names, position, velocity, simulation.joint_torque, stamp, frame)
+
+
+def desired_joints(simulation: Simulation, frame: str) -> JointState:
+    """The reference that the controller follows."""
+    position, velocity, _ = simulation.follower.reference(simulation.time)
+    names, stamp = simulation.robot.joint_names, SIMULATED.stamp(simulation.time)
+    return joint_state_message(names, position, velocity, np.zeros(0), stamp, frame)
+
+
+def external_wrench(simulation: Simulation, frame: str) -> WrenchStamped:
+    """The force that the object exerts on the tool, along the axes of the base."""
+    message = WrenchStamped()
+    message.header.stamp, message.header.frame_id = SIMULATED.stamp(simulation.time), frame
+    force = message.wrench.force
+    force.x, force.y, force.z = (-simulation.tool_contact_force()).tolist()
+    return message
+
+
+def true_object(simulation: Simulation, frame: str) -> Odometry:
+    """Where the object really is."""
+    pose, twist = simulation.object_pose(), simulation.object_twist()
+    return state_message(ObjectState(simulation.time, pose, twist, np.zeros((6, 6))), SIMULATED, frame)
+
+
+def true_tool(simulation: Simulation, frame: str) -> Odometry:
+    """Where the tip of the tool is and how it moves, along the axes of the base."""
+    message = Odometry(child_frame_id="fr3_tool")
+    message.header.stamp, message.header.frame_id = SIMULATED.stamp(simulation.time), frame
+    position, velocity = message.pose.pose.position, message.twist.twist.linear
+    position.x, position.y, position.z = simulation.tool_position().tolist()
+    velocity.x, velocity.y, velocity.z = simulation.tool_velocity().tolist()
+    message.pose.pose.orientation.w = 1.0
+    return message
+
+
+def scene_markers(simulation: Simulation, frame: str) -> MarkerArray:
+    """Arm and object."""
+    make, plant = markers.MarkerFactory(frame, SIMULATED.stamp(simulation.time)), simulation.scene.plant
+    arm, pose = markers.arm_points(simulation.joint_position), simulation.object_pose()
+    drawn = [
+        make.line("robot", arm, markers.ROBOT, 0.03),
+        make.shape("object", plant.shape, pose, markers.OBJECT, plant.height),
+        make.shape("object_foot", plant.shape, pose, markers.OBJECT),
+    ]
+    return MarkerArray(markers=drawn)
+
+
+def limit_violations(simulation: Simulation) -> int:
+    """Instants beyond a limit of the motion; torques asked for in excess are cut, and counted apart."""
+    seen = simulation.limits.report()
+    return sum(report.instants for kind, report in seen.items() if not kind.startswith("torque"))
+
+
+def figures(simulation: Simulation) -> dict[str, Any]:
+    """What the diagnostics say about limits and tracking."""
+    controller = simulation.controller
+    values: dict[str, Any] = {
+        "simulated_time_s": f"{simulation.time:.3f}",
+        "steps": simulation.steps,
+        "limit_violations": limit_violations(simulation),
+        "torque_saturations": int(controller.saturated.sum()),
+        "torque_rate_saturations": int(controller.rate_limited.sum()),
+        "tool_height_deviation_mm": f"{1e3 * simulation.tool_height_deviation:.3f}",
+    }
+    for kind, seen in simulation.limits.report().items():
+        # Torques count as asked for; the controller cuts what is too much, so the arm never sees it.
+        group = "demand" if kind.startswith("torque") else "limit"
+        values[f"{group}.{kind}.instants"] = seen.instants
+        values[f"{group}.{kind}.worst"] = f"{seen.worst:.4f}"
+    return values
