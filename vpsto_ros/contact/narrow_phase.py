@@ -8,11 +8,17 @@ out of the object, and the contact point ``PX, PY`` on the object.
 """
 
 import math
+from typing import Any
 
 from numba import njit
 
 # Fused multiply-adds and reciprocals are welcome; NaN and infinity keep their meaning.
-COMPILED = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
+COMPILED: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "arcp", "nsz"},
+}
 
 GAP, NX, NY, PX, PY = 0, 1, 2, 3, 4
 
