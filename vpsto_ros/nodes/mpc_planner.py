@@ -59,7 +59,7 @@ class MpcPlannerConfig(NodeConfig):
         maximum=0.5,
     )
     joint_timeout: float = option(
-        0.2, "nothing is published when joint_states are older", unit="s", minimum=0.02, maximum=10.0
+        0.1, "nothing is published when joint_states are older", unit="s", minimum=0.02, maximum=10.0
     )
     contact_timeout: float = option(
         0.5, "a contact_plan received longer ago is not used", unit="s", minimum=0.02, maximum=10.0
@@ -252,12 +252,14 @@ class MpcPlannerNode(ManagedNode):
 
     def _step(self, now: float, begin: float) -> MpcStep | None:
         config, joints = self.config, self.joints
+        # Where the arm is now rather than when it was measured, or a late message would look like a lost arm.
+        position = joints.position + joints.velocity * max(now - joints.stamp, 0.0)
         contact = self.contact
         fresh = contact is not None and now - contact[0] <= config.contact_timeout
+        deadline = begin + max(config.deadline - config.reserve, 0.0)
         try:
             return self.planner.step(
-                now, joints.position, joints.velocity, self.object, self.goal, contact[1] if fresh else None,
-                deadline=begin + max(config.deadline - config.reserve, 0.0),
+                now, position, joints.velocity, self.object, self.goal, contact[1] if fresh else None, deadline=deadline
             )  # fmt: skip
         except VpstoError as error:
             # A state from which the planner finds no way: what was published last ends in a stop.
