@@ -30,10 +30,16 @@ class PushingCosts:
     smoothness: float = option(0.0, "weight of the squared acceleration, per limit squared and second", minimum=0.0, maximum=1e3)
     horizon: float = option(6.0, "longest trajectory that counts as valid", unit="s", minimum=0.5, maximum=60.0)
     minimum_gain: float = option(0.0005, "smallest reduction of the error that makes a candidate valid", unit="m", minimum=0.0, maximum=1.0)
-    model_spread: float = option(
-        0.0, "relative spread of pressure radius and friction over which costs are averaged; 0 plans with one model",
-        minimum=0.0, maximum=0.9,
+    regress: float = option(
+        2.0, "how much more an increase of the error on the way costs than error at the end; keeps the tool from dragging the object along",
+        minimum=0.0, maximum=100.0,
     )  # fmt: skip
+    pressure_spread: float = option(
+        0.25, "relative spread of the pressure radius in the three models over which costs are averaged", minimum=0.0, maximum=0.9
+    )
+    friction_spread: float = option(
+        0.6, "relative spread of the tool's friction in those models; both 0: one model", minimum=0.0, maximum=1.0
+    )
     samples: int = option(64, "samples along a trajectory", minimum=8, maximum=1000)
     end_point: str = option("free", "where trajectories end: free, or at the object's centre as in the thesis", choices=("free", "object"))
 
@@ -82,6 +88,7 @@ class PushOutcome:
         motion: the candidate motions of the tool.
         poses: predicted object poses, shape (B, K, 3) of the nominal model.
         error: goal error at the end, averaged over the models, shape (B,) [m].
+        regress: sum of all increases of the error on the way, averaged over the models, shape (B,) [m].
         rotation: |rotation| of the object, averaged over the models, shape (B,) [rad].
         excess: largest violation of a region by tool or object, shape (B,) [m].
     """
@@ -89,6 +96,7 @@ class PushOutcome:
     motion: TrajectoryBatch
     poses: NDArray
     error: NDArray
+    regress: NDArray
     rotation: NDArray
     excess: NDArray
 
@@ -142,10 +150,10 @@ class PushingProblem:
         self._fixed_end = pose[:2] if costs.end_point == "object" else None
 
     def evaluate(self, points: NDArray) -> Evaluation:
-        """Costs [s] and validity of candidates (B, P, 2): 60 |e_T| + T + rotation (+ smoothness); see :class:`PushingCosts`."""
+        """Costs [s] and validity of candidates (B, P, 2): error, regress, T, rotation, smoothness; see :class:`PushingCosts`."""
         outcome, costs = self.outcome(points), self.costs
         motion = outcome.motion
-        cost = costs.error * outcome.error + motion.duration
+        cost = costs.error * (outcome.error + costs.regress * outcome.regress) + motion.duration
         if self.goal.yaw is None:
             cost = cost + costs.rotation * outcome.rotation
         if costs.smoothness > 0.0:
@@ -165,11 +173,12 @@ class PushingProblem:
             derivatives=self.costs.smoothness > 0.0,
         )  # fmt: skip
         poses = self._rollouts(motion.position + self.tool_offset)
-        error = self.goal.error(poses[:, :, -1], self.model.pressure_radius).mean(axis=0)
+        errors = self.goal.error(poses, self.model.pressure_radius)
+        regress = np.maximum(np.diff(errors, axis=-1), 0.0).sum(axis=-1).mean(axis=0)
         rotation = np.abs(poses[:, :, -1, 2] - self.pose[2]).mean(axis=0)
         leaves = self.workspace.object_excess(poses, self.workspace.margin).max(axis=0)
         excess = np.maximum(self.workspace.tool_excess(motion.position), np.maximum(leaves - self._allowed_excess, 0.0))
-        return PushOutcome(motion, poses[len(poses) // 2], error, rotation, excess)
+        return PushOutcome(motion, poses[len(poses) // 2], errors[..., -1].mean(axis=0), regress, rotation, excess)
 
     def trajectory(self, points: NDArray) -> Trajectory:
         """The timed plane trajectory of one candidate (P, 2)."""
@@ -224,15 +233,14 @@ class PushingProblem:
 
     def _rollouts(self, path: NDArray) -> NDArray:
         """Object poses (models, B, K, 3): the nominal model in the middle, a slippery and a sticky one around it."""
-        spread = self.costs.model_spread
-        factors = np.array([1.0] if spread == 0.0 else [1.0 - spread, 1.0, 1.0 + spread])
-        per_candidate = np.repeat(factors, len(path))
-        tiled = np.tile(path, (len(factors), 1, 1))
+        signs = np.array([-1.0, 0.0, 1.0] if max(self.costs.pressure_spread, self.costs.friction_spread) > 0.0 else [0.0])
+        per_candidate = np.repeat(signs, len(path))
         poses = rollout(
-            self.model, self.pose, tiled,
-            pressure_radius=self.model.pressure_radius * per_candidate, friction=self.model.friction * per_candidate,
+            self.model, self.pose, np.tile(path, (len(signs), 1, 1)),
+            pressure_radius=self.model.pressure_radius * (1.0 + self.costs.pressure_spread * per_candidate),
+            friction=self.model.friction * (1.0 + self.costs.friction_spread * per_candidate),
         ).object_pose  # fmt: skip
-        return poses.reshape(len(factors), *path.shape[:2], 3)
+        return poses.reshape(len(signs), *path.shape[:2], 3)
 
 
 def _resampled(polyline: NDArray, count: int) -> NDArray:
