@@ -17,7 +17,7 @@ from vpsto_ros.contact.projection import CONTACT_COLUMNS, SLIP, refine_contact, 
 
 PENETRATION_TOLERANCE = 1e-6
 # A correction this small leaves a gap well below the tolerance: the error is quadratic.
-SMALL_CHANGE = 1e-4
+SMALL_CHANGE = 5e-5
 STEP_ITERATIONS = 8
 START_ITERATIONS = 60
 # Longest displacement of one linearised projection: what a regular step needs, times this.
