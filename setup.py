@@ -26,9 +26,16 @@ setup(
     python_requires=">=3.11",
     install_requires=["numpy>=1.26", "scipy>=1.11", "numba>=0.59", "pin>=3"],
     extras_require={
-        # A source build gets these from the ROS installation. Only the ros-jazzy-* names are pinned to one ROS distribution.
+        # With colcon these come from the ROS installation. Only ros-jazzy-* names stick to one distribution.
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
-        "sim": ["mujoco>=4,<5", "matplotlib>=3.8", "tqdm>=4.60", "rosbags>=0.10.11", "viser>=1.0", "imageio[ffmpeg]>=2.30"],
+        "sim": [
+            "mujoco>=4,<5",
+            "matplotlib>=3.8",
+            "tqdm>=4.60",
+            "rosbags>=0.10.11",
+            "viser>=1.0",
+            "imageio[ffmpeg]>=2.30",
+        ],
         "pycma": ["cma>=4"],
         "test": ["pytest>=7", "pytest-xdist>=3.5", "hypothesis>=6"],
         "lint": ["ruff>=0.12", "mypy>=1.11"],

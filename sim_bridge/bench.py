@@ -42,7 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         InvalidInputError: when no row has such a name.
     """
-    wanted = {name: measure for name, measure in BENCHMARKS.items() if not arguments.only or arguments.only in name}
+    wanted = {
+        name: measure for name, measure in BENCHMARKS.items() if not arguments.only or arguments.only in name
+    }
     if not wanted:
         raise InvalidInputError(f"no row is called {arguments.only!r}; there are {', '.join(BENCHMARKS)}")
     rows = []
@@ -51,7 +53,8 @@ def run(arguments: argparse.Namespace) -> int:
         row = {"name": name, **measure()}
         rows.append(row)
         extra = f"   {row['real_time_factor']:.1f} x real time" if "real_time_factor" in row else ""
-        print(f"{name:34s} {row['cores']:5d} {row['p50_ms']:10.3f} {row['p99_ms']:10.3f} {row['max_ms']:10.3f}{extra}", flush=True)
+        times = " ".join(f"{row[key]:10.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
+        print(f"{name:34s} {row['cores']:5d} {times}{extra}", flush=True)
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(rows, indent=2) + "\n")
     return 0
@@ -59,14 +62,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 def synthesis() -> Row:
     """100 trajectories of 7 joints through 4 via-points with minimal duration, 50 samples each."""
-    rng, limits, basis = np.random.default_rng(0), fr3_pusher().limits, OptimalBasis.uniform(4)
-    keys = rng.uniform(limits.lower, limits.upper, (100, 6, 7))
+    robot, rng, basis = fr3_pusher(), np.random.default_rng(0), OptimalBasis.uniform(4)
+    keys = rng.uniform(*robot.position_range, (100, 6, 7))
     rest = np.zeros(7)
-    return repeat(lambda: synthesize_batch(basis, keys, rest, rest, limits, 50), 2000)
+    return repeat(lambda: synthesize_batch(basis, keys, rest, rest, robot.limits, 50), 2000)
 
 
 def vpsto_iteration() -> Row:
-    """One iteration for 7 joints: sample 64 candidates, synthesise, find the tool, push a box, update the search."""
+    """One iteration for 7 joints: 64 candidates sampled, synthesised and rolled out on a box."""
     robot, basis = fr3_pusher(), OptimalBasis.uniform(3)
     rest = np.zeros(7)
     start, end = TableMap(robot, 0.02).joints([(0.38, 0.0), (0.55, 0.05)])
@@ -91,12 +94,18 @@ def vpsto_iteration() -> Row:
 
 def mpc_step() -> Row:
     """Replanning as in the demo, over ten seconds of closed loop with a goal that jumps every two."""
-    goals = [PlanarGoal(np.array(point), None) for point in ((0.55, 0.12), (0.48, -0.12), (0.58, 0.0), (0.45, 0.1))]
+    goals = [
+        PlanarGoal(np.array(point), None) for point in ((0.55, 0.12), (0.48, -0.12), (0.58, 0.0), (0.45, 0.1))
+    ]
     with one_core():
         loop = push_box_loop()
         loop.goal = lambda now: goals[int(now / 2.0) % len(goals)]
         loop.advance(10.0)
-    planned = [time for time, mode in zip(loop.recording.compute, loop.recording.mode, strict=True) if mode not in ("wait", "hold")]
+    planned = [
+        time
+        for time, mode in zip(loop.recording.compute, loop.recording.mode, strict=True)
+        if mode not in ("wait", "hold")
+    ]
     return statistics(planned, cores=1)
 
 

@@ -13,11 +13,11 @@ from vpsto_ros.exceptions import VpstoError
 
 EXAMPLES = """\
 examples:
-  vpsto demo push_box                         watch the arm push a box to a moving target; results in output/push_box
+  vpsto demo push_box                         an arm pushes a box to a moving target; see output/push_box
   vpsto demo push_box --viewer                the same with a live 3-D view in the browser
   vpsto demo push_box --real-time-factor 0.5  on a slow machine: simulated time runs at half speed
-  vpsto experiment push_box --runs 20         the closed loop on 20 random boxes, in lock-step and without ROS
-  vpsto bench --json bench.json               how long synthesis, search, replanning and the driver take here
+  vpsto experiment push_box --runs 20         20 random boxes, in lock-step and without ROS
+  vpsto bench --json bench.json               how long search, replanning and simulation take here
 
 exit status: 0 success, 1 the run failed, 2 the command was not understood
 """
@@ -61,18 +61,20 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The command line.
 
     Args:
-        chosen: the arguments that will be parsed. Only the experiment named there is imported for its own options, so that
-            ``vpsto --help`` answers at once.
+        chosen: the arguments that will be parsed. Only the experiment named there is imported for its own
+            options, so that ``vpsto --help`` answers at once.
     """
     parser = argparse.ArgumentParser(
         prog="vpsto",
-        description="Plan contact in real time with via-point-based stochastic trajectory optimisation (VP-STO).",
+        description="Plan contact in real time by via-point-based stochastic trajectory optimisation.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"vpsto {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    demo = commands.add_parser("demo", help="run the nodes as separate processes over ROS 2 topics and judge the run")
+    demo = commands.add_parser(
+        "demo", help="run the nodes as separate processes over ROS 2 topics and judge the run"
+    )
     _add_modules(demo, "DEMO", DEMOS, _demo_arguments)
     experiment = commands.add_parser("experiment", help="repeat a task many times in lock-step, without ROS")
     experiments = _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, _experiment_arguments)
@@ -94,7 +96,9 @@ def _add_modules(
     add_arguments: Callable[[argparse.ArgumentParser, str], None],
 ) -> dict[str, argparse.ArgumentParser]:
     """One subcommand per module; returns their parsers by name."""
-    names = parser.add_subparsers(dest="name", metavar=noun, required=True, help="one of: " + ", ".join(modules))
+    names = parser.add_subparsers(
+        dest="name", metavar=noun, required=True, help="one of: " + ", ".join(modules)
+    )
     parsers = {}
     for name, module in modules.items():
         parsers[name] = names.add_parser(name)
@@ -104,14 +108,24 @@ def _add_modules(
 
 
 def _demo_arguments(parser: argparse.ArgumentParser, name: str) -> None:
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of camera noise and search (default 0)")
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="of camera noise and search (default 0)"
+    )
     parser.add_argument(
         "--duration", type=positive, default=60.0, metavar="S", help="simulated seconds at most (default 60)"
     )
-    parser.add_argument("--out", default=f"output/{name}", metavar="DIR", help=f"results (default output/{name})")
-    parser.add_argument("--viewer", action="store_true", help="open a live 3-D view in the browser, on 127.0.0.1")
     parser.add_argument(
-        "--real-time-factor", type=positive, default=1.0, metavar="X", help="simulated per real second (default 1)"
+        "--out", default=f"output/{name}", metavar="DIR", help=f"results (default output/{name})"
+    )
+    parser.add_argument(
+        "--viewer", action="store_true", help="open a live 3-D view in the browser, on 127.0.0.1"
+    )
+    parser.add_argument(
+        "--real-time-factor",
+        type=positive,
+        default=1.0,
+        metavar="X",
+        help="simulated per real second (default 1)",
     )
 
 

@@ -9,7 +9,10 @@ from vpsto_ros.exceptions import InvalidInputError
 
 
 def test_rows_have_the_promised_columns(tmp_path, monkeypatch, capsys):
-    fast = {"first": lambda: bench.statistics([0.001, 0.003], cores=1), "second": lambda: bench.statistics([0.5], cores=2)}
+    fast = {
+        "first": lambda: bench.statistics([0.001, 0.003], cores=1),
+        "second": lambda: bench.statistics([0.5], cores=2),
+    }
     monkeypatch.setattr(bench, "BENCHMARKS", fast)
     assert bench.run(argparse.Namespace(json=str(tmp_path / "bench.json"), only=None)) == 0
     rows = json.loads((tmp_path / "bench.json").read_text())
@@ -34,6 +37,8 @@ def test_percentiles_are_of_the_durations():
 
 
 def test_every_row_measures_something(monkeypatch):
-    monkeypatch.setattr(bench, "repeat", lambda action, times: bench.statistics(bench.measure(action, 2), cores=1))
+    monkeypatch.setattr(
+        bench, "repeat", lambda action, times: bench.statistics(bench.measure(action, 2), cores=1)
+    )
     for measure in (bench.synthesis, bench.vpsto_iteration):
         assert measure()["p50_ms"] > 0.0

@@ -14,7 +14,12 @@ def outcome(capsys, *arguments):
 def test_help_shows_examples(capsys):
     code, text = outcome(capsys, "--help")
     assert code == 0
-    for example in ("vpsto demo push_box", "--viewer", "vpsto experiment push_box --runs", "vpsto bench --json"):
+    for example in (
+        "vpsto demo push_box",
+        "--viewer",
+        "vpsto experiment push_box --runs",
+        "vpsto bench --json",
+    ):
         assert example in text.out
 
 

@@ -6,8 +6,20 @@ import pytest
 
 from sim_bridge.demo.processes import ProcessGroup
 
-OBEDIENT = "import time\nprint('here', flush=True)\ntry:\n    time.sleep(60)\nexcept KeyboardInterrupt:\n    print('bye')\n"
-STUBBORN = "import signal, time\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nprint('here', flush=True)\ntime.sleep(60)\n"
+OBEDIENT = """
+import time
+try:
+    print('here')
+    time.sleep(60)
+except KeyboardInterrupt:
+    print('bye')
+"""
+STUBBORN = """
+import signal, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+print('here')
+time.sleep(60)
+"""
 DEAF = STUBBORN.replace("print", "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nprint")
 
 
@@ -42,7 +54,9 @@ def test_nothing_survives_an_exception(tmp_path):
 
 def test_a_process_that_ends_is_noticed_with_its_last_words(tmp_path):
     with ProcessGroup(tmp_path, {"GREETING": "hello"}) as group:
-        group.start("one", [sys.executable, "-c", "import os, sys; print(os.environ['GREETING']); sys.exit(3)"])
+        group.start(
+            "one", [sys.executable, "-c", "import os, sys; print(os.environ['GREETING']); sys.exit(3)"]
+        )
         deadline = time.monotonic() + 20.0
         while not group.ended() and time.monotonic() < deadline:
             time.sleep(0.01)

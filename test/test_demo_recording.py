@@ -31,7 +31,9 @@ def pose(x, y, yaw):
     return message(
         "geometry_msgs/msg/Pose",
         position=message("geometry_msgs/msg/Point", x=x, y=y, z=0.0),
-        orientation=message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)),
+        orientation=message(
+            "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)
+        ),
     )
 
 
@@ -59,13 +61,20 @@ def trajectory(seconds, positions):
         )
         for index, row in enumerate(positions)
     ]  # fmt: skip
-    return message("trajectory_msgs/msg/JointTrajectory", header=header(seconds), joint_names=NAMES, points=points)
+    return message(
+        "trajectory_msgs/msg/JointTrajectory", header=header(seconds), joint_names=NAMES, points=points
+    )
 
 
 def diagnostic(seconds, level, **values):
     pairs = [message("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in values.items()]
     status = message(
-        "diagnostic_msgs/msg/DiagnosticStatus", level=level, name="mpc_planner", message="ok", hardware_id="", values=pairs
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=level,
+        name="mpc_planner",
+        message="ok",
+        hardware_id="",
+        values=pairs,
     )
     return message("diagnostic_msgs/msg/DiagnosticArray", header=header(seconds), status=[status])
 
@@ -146,18 +155,28 @@ def good_run():
     joints = np.tile(TableMap(robot, 0.02).joints([(0.5, 0.0)])[0], (time.size, 1))
     still = np.zeros_like(joints)
     target = np.tile([0.5, 0.1, 0.0], (time.size, 1))
-    commands = [Command(t, t + np.array([0.0, 1.0]), joints[:2], still[:2], None) for t in np.arange(0.0, 10.0, 0.05)]
-    values = {"compute_p50_ms": "3", "compute_p99_ms": "5", "compute_max_ms": "9", "deadline_misses": "1", "cycles": "200"}
+    commands = [
+        Command(t, t + np.array([0.0, 1.0]), joints[:2], still[:2], None) for t in np.arange(0.0, 10.0, 0.05)
+    ]
+    values = {
+        "compute_p50_ms": "3",
+        "compute_p99_ms": "5",
+        "compute_max_ms": "9",
+        "deadline_misses": "1",
+        "cycles": "200",
+    }
     diagnostics = {"mpc_planner": [Status(9.9, 0, "ok", values)]}
     return Recording(
-        JointSeries(time, joints, still, still.copy()), PoseSeries(time, target), PoseSeries(time, target), PoseSeries(time, target),
+        JointSeries(time, joints, still, still.copy()), *[PoseSeries(time, target) for _ in range(3)],
         commands, diagnostics,
     )  # fmt: skip
 
 
 def good_story():
     story = Scenario(np.random.default_rng(0))
-    story.phases = [Phase(phase.name, phase.timeout, i, i + 1.0, i + 0.5) for i, phase in enumerate(story.phases)]
+    story.phases = [
+        Phase(phase.name, phase.timeout, i, i + 1.0, i + 0.5) for i, phase in enumerate(story.phases)
+    ]
     story.drift_distances = [0.01, 0.02, 0.03]
     return story
 
@@ -181,7 +200,10 @@ def test_a_good_run_is_a_success_with_all_promised_figures():
 def test_each_shortcoming_fails_the_run():
     base = summarize(good_run(), good_story(), fr3_pusher(), FACTS)
     assert failures(base) == []
-    late = [{**phase, "time_to_reach_s": math.nan} if phase["name"] == "knock" else phase for phase in base["phases"]]
+    late = [
+        {**phase, "time_to_reach_s": math.nan} if phase["name"] == "knock" else phase
+        for phase in base["phases"]
+    ]
     for change, word in [
         ({"phases": late}, "knock"),
         ({"drift": {"median_distance_m": 0.03}}, "30 mm"),
@@ -209,4 +231,9 @@ def test_violations_are_counted_wherever_they_happen():
     run.commands.append(Command(1.0, np.array([1.0, 2.0]), fast, np.zeros((2, 7)), None))
     assert command_violations(run.commands[-1], robot.limits)
     counts = limit_violations(run, robot)
-    assert counts == {"measured_position": 1, "measured_velocity": 1, "measured_torque": 1, "published_trajectory": 1}
+    assert counts == {
+        "measured_position": 1,
+        "measured_velocity": 1,
+        "measured_torque": 1,
+        "published_trajectory": 1,
+    }

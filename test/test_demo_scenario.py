@@ -73,7 +73,11 @@ def test_targets_are_in_the_area_and_a_jump_apart():
     for seed in range(20):
         story = scenario(seed)
         history = act(story, obedient)
-        jumps = [0] + [i for i in range(1, len(history)) if np.linalg.norm(history[i][1].goal - history[i - 1][1].goal) > 0.02]
+        jumps = [0] + [
+            i
+            for i in range(1, len(history))
+            if np.linalg.norm(history[i][1].goal - history[i - 1][1].goal) > 0.02
+        ]
         assert len(jumps) == 3
         for index in jumps:
             _, orders, box = history[index]

@@ -37,7 +37,9 @@ def test_without_a_target_none_is_seen(model, target):
 def test_the_replay_is_one_page_that_loads_nothing(model):
     joints = Scene().joints()
     path = np.linspace([0.4, 0.0], [0.5, 0.1], 30)
-    frames = [Frame(joints + 0.01 * i, np.array([0.5, 0.01 * i, 0.0]), np.array([0.6, 0.0]), path) for i in range(5)]
+    frames = [
+        Frame(joints + 0.01 * i, np.array([0.5, 0.01 * i, 0.0]), np.array([0.6, 0.0]), path) for i in range(5)
+    ]
     page = replay_page(model, fr3_pusher().joint_names, frames, 20.0)
     assert "__VISER_EMBED_DATA__" in page
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=\"(?!data:)", page)
@@ -48,7 +50,15 @@ def test_a_report_embeds_pictures_and_replay_and_escapes_text(tmp_path):
     picture.write_bytes(b"\x89PNG fake")
     replay = '<html><script>var a = "b" < 3 && 1;</script></html>'
     out = tmp_path / "report.html"
-    write_page(out, "Box & co", "3 < 4", True, [("Table", [["a", "b"], ["x", "<1>"]])], [(picture, "a chart")], replay)
+    write_page(
+        out,
+        "Box & co",
+        "3 < 4",
+        True,
+        [("Table", [["a", "b"], ["x", "<1>"]])],
+        [(picture, "a chart")],
+        replay,
+    )
     text = out.read_text()
     assert "Box &amp; co" in text and "3 &lt; 4" in text and "&lt;1&gt;" in text
     assert 'src="data:image/png;base64,' in text

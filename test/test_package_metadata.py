@@ -48,12 +48,20 @@ def test_every_entry_point_exists(target):
 def test_every_message_package_that_is_imported_is_declared():
     declared = {element.text for element in PACKAGE.findall("exec_depend")}
     imported = set()
-    for file in [*ROOT.glob("vpsto_ros/**/*.py"), *ROOT.glob("sim_bridge/**/*.py"), *ROOT.glob("launch/*.py")]:
+    for file in [
+        *ROOT.glob("vpsto_ros/**/*.py"),
+        *ROOT.glob("sim_bridge/**/*.py"),
+        *ROOT.glob("launch/*.py"),
+    ]:
         for node in ast.walk(ast.parse(file.read_text())):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
             imported |= {name.split(".")[0] for name in names}
-    ros = {name for name in imported if name.endswith(("_msgs", "_srvs", "_interfaces")) or name in ("rclpy", "launch", "launch_ros")}
+    ros = {
+        name
+        for name in imported
+        if name.endswith(("_msgs", "_srvs", "_interfaces")) or name in ("rclpy", "launch", "launch_ros")
+    }
     assert ros <= declared
 
 
@@ -65,8 +73,11 @@ def modules(room):
 
 
 def test_the_library_needs_neither_ros_nor_a_simulator():
-    code = f"import importlib, sys\nfor name in {list(modules('vpsto_ros'))!r}: importlib.import_module(name)\nprint(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    names = list(modules("vpsto_ros"))
+    code = f"import importlib, sys\nfor name in {names!r}: importlib.import_module(name)\nprint(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.split()
     assert "vpsto_ros.trajectory" in loaded
     tops = {name.split(".")[0] for name in loaded}
     assert tops.isdisjoint({"rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags"})

@@ -41,8 +41,14 @@ def write_artifacts(
     tool = forward_kinematics_batch(recording.joints.position)[:, :2]
     shape = settings.scene.plant.shape
     charts = [
-        (out / "distance.png", "Distance between box and target. Vertical lines: the target jumps, the knock, the drift."),
-        (out / "top_view.png", "Seen from above: paths of box, target and tool; box at the start (faint) and at the end."),
+        (
+            out / "distance.png",
+            "Distance between box and target. Vertical lines: the target jumps, the knock, the drift.",
+        ),
+        (
+            out / "top_view.png",
+            "Seen from above: paths of box, target and tool; box at the start (faint) and at the end.",
+        ),
         (out / "joints.png", "Joint velocities and torques as shares of their limits."),
         (out / "compute.png", "Compute time of a planning step as the planner reports it."),
     ]
@@ -71,7 +77,7 @@ def replay_frames(recording: Recording, start: float) -> list[Frame]:
 
 
 def planned_paths(recording: Recording, times: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
-    """The path of the tool's tip (P, 2) [m] that the newest trajectory still has ahead at each time; None without any."""
+    """Paths of the tool's tip (P, 2) [m] ahead in the newest trajectory at each time; None without any."""
     received = np.array([command.received for command in recording.commands])
     newest = np.searchsorted(received, times, side="right") - 1
     paths: list[NDArray[np.float64] | None] = []

@@ -44,6 +44,7 @@ TOPICS = {
     JOINT_STATES: JointState,
     JOINT_TRAJECTORY: JointTrajectory,
     GROUND_TRUTH: Odometry,
+    "/franka_driver/ground_truth/tool": Odometry,
     GOAL_POSE: PoseStamped,
     "/object_pose": PoseWithCovarianceStamped,
     "/object_state": Odometry,
@@ -113,7 +114,7 @@ class Observer(Node):
     def _receiver(self, topic: str) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:
             if topic == CLOCK:
-                # A 4-byte header, then seconds and nanoseconds: no need to build a message hundreds of times per second.
+                # A 4-byte header, seconds and nanoseconds: cheaper than building a message.
                 seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
                 self.simulated_time = seconds + 1e-9 * nanoseconds
             self._latest[topic] = data

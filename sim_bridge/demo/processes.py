@@ -32,7 +32,7 @@ class ProcessGroup:
     def start(self, name: str, command: Sequence[str]) -> None:
         """Start a process under a name."""
         with open(self.log_path(name), "wb") as log:
-            # In a session of its own: Ctrl-C in the terminal reaches only the parent, which then stops them in order.
+            # In a session of its own: Ctrl-C in the terminal reaches only the parent, which stops them all.
             self._processes[name] = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,

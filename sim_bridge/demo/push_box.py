@@ -1,4 +1,4 @@
-"""``vpsto demo push_box``: the four nodes as processes of their own, a target that moves, a verdict and pictures."""
+"""``vpsto demo push_box``: four nodes in processes of their own, a moving target, a verdict and pictures."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NODES = {
     "mpc_planner": "vpsto_ros.nodes.mpc_planner",
 }
 START_PATIENCE = 180.0
-"""How long the nodes may take to become active [s]; without a kernel cache they compile for a minute or two."""
+"""How long the nodes may take to become active [s]; without a kernel cache they compile first."""
 
 
 @dataclass
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.seed, outcome.first_plan, outcome.elapsed, outcome.trouble or [], settings.scene.tool_height
     )
     summary = summarize(recording, outcome.scenario, fr3_pusher(), facts)
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (out / "summary.json").write_text(json.dumps(_plain(summary), indent=2) + "\n")
     notes = write_artifacts(out, recording, summary, settings, verdict(summary))
     print(verdict(summary))
     for note in notes:
@@ -105,7 +105,7 @@ def verdict(summary: dict[str, Any]) -> str:
         f"SUCCESS: the box came to rest at every target within {max(times):.1f} s, kept "
         f"{summary['drift']['median_distance_m'] * 1e3:.0f} mm to the drifting one (median) and ended "
         f"{summary['final_error_m'] * 1e3:.1f} mm from it; no limit was violated, "
-        f"{summary['mpc']['deadline_misses']:.0f} of {summary['mpc']['cycles']:.0f} replanning deadlines were missed."
+        f"{summary['mpc']['deadline_misses']:.0f} of {summary['mpc']['cycles']:.0f} deadlines were missed."
     )
 
 
@@ -135,9 +135,8 @@ def _run_nodes(arguments: argparse.Namespace, settings: Settings, bag: BagRecord
             outcome.trouble.append("the simulation did not get to the end of the scenario in time")
         codes = processes.stop()
     outcome.trouble += [f"{name} exited with status {code}" for name, code in codes.items() if code != 0]
-    for name, code in codes.items():
-        if code != 0:
-            print(f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}", file=sys.stderr)
+    for name in (name for name, status in codes.items() if status != 0):
+        print(f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}", file=sys.stderr)
     return outcome
 
 
@@ -171,18 +170,21 @@ def _wait_until_active(observer: Observer, processes: ProcessGroup) -> None:
     print("starting the nodes ...", flush=True)
     activity = Activity(observer, tuple(NODES))
     deadline = time.monotonic() + START_PATIENCE
-    while not (activity.poll() and observer.subscribers_of_goal() >= 2 and observer.object_pose() is not None):
+    while not (
+        activity.poll() and observer.subscribers_of_goal() >= 2 and observer.object_pose() is not None
+    ):
         for name in processes.ended():
-            raise VpstoError(
-                f"{name} ended while starting; the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}"
-            )
+            log = f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}"
+            raise VpstoError(f"{name} ended while starting; {log}")
         if time.monotonic() > deadline:
             waiting = ", ".join(sorted(activity.waiting)) or "their topics"
             raise VpstoError(f"the nodes were not ready after {START_PATIENCE:.0f} s, waiting for {waiting}")
         time.sleep(0.02)
 
 
-def _watch(observer: Observer, processes: ProcessGroup, scenario: Scenario, show: Any, deadline: float) -> None:
+def _watch(
+    observer: Observer, processes: ProcessGroup, scenario: Scenario, show: Any, deadline: float
+) -> None:
     """Show progress until the scenario is over, a process has ended or the deadline has passed."""
     announced: set[str] = set()
     with tqdm(total=100, disable=None, bar_format="{desc} |{bar}| {elapsed}") as bar:
@@ -193,7 +195,9 @@ def _watch(observer: Observer, processes: ProcessGroup, scenario: Scenario, show
             pose, goal = observer.object_pose(), observer.goal()
             if pose is not None and goal is not None:
                 distance = float(np.linalg.norm(pose[:2] - goal)) * 1e3
-                bar.set_description_str(f"{scenario.phase.name:9s} {distance:5.0f} mm to target", refresh=False)
+                bar.set_description_str(
+                    f"{scenario.phase.name:9s} {distance:5.0f} mm to target", refresh=False
+                )
             bar.n = round(100 * scenario.progress)
             bar.refresh()
     _announce(scenario, announced)
@@ -239,6 +243,15 @@ def _viewer(wanted: bool, settings: Settings) -> Iterator[Any]:
         yield show
     finally:
         server.stop()
+
+
+def _plain(value: Any) -> Any:
+    """The same with None for what JSON cannot hold: numbers that are not finite."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _interrupt(*_: object) -> None:

@@ -1,4 +1,4 @@
-"""What happens to the target and to the box in the pushing demo: jumps, one knock by hand, a drift. No ROS, no clock."""
+"""What happens to target and box in the pushing demo: jumps, one knock by hand, a drift. No ROS, no clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ class Area:
         """Whether a point (2,) [m] lies in the area."""
         return bool(self.x[0] <= point[0] <= self.x[1] and self.y[0] <= point[1] <= self.y[1])
 
-    def sample(self, rng: np.random.Generator, away_from: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
+    def sample(
+        self, rng: np.random.Generator, away_from: NDArray[np.float64], distance: float
+    ) -> NDArray[np.float64]:
         """A random point (2,) that keeps a distance [m] from another one."""
         while True:
             point = np.array([rng.uniform(*self.x), rng.uniform(*self.y)])
@@ -58,7 +60,7 @@ class Phase:
 
     @property
     def time_to_reach(self) -> float:
-        """From the beginning of the phase until the box was at the target and stayed [s]; NaN if it never was."""
+        """From the start of the phase until the box was at the target and stayed [s]; NaN if it never was."""
         return self.reached - self.start
 
 
@@ -68,7 +70,9 @@ class Knock:
     The force grows for as long as the box does not follow, so neither mass nor friction has to be known.
     """
 
-    def __init__(self, direction: NDArray[np.float64], distance: float, speed: float = 0.25, force_limit: float = 20.0):
+    def __init__(
+        self, direction: NDArray[np.float64], distance: float, speed: float = 0.25, force_limit: float = 20.0
+    ):
         """Describe the shove.
 
         Args:
@@ -136,7 +140,14 @@ class Scenario:
     def __post_init__(self) -> None:
         """Lay out the phases."""
         jump, drift = 0.16 * self.duration, 0.2 * self.duration
-        limits = {"target 1": jump, "target 2": jump, "knock": jump, "target 3": jump, "drift": drift, "rest": jump}
+        limits = {
+            "target 1": jump,
+            "target 2": jump,
+            "knock": jump,
+            "target 3": jump,
+            "drift": drift,
+            "rest": jump,
+        }
         self.phases = [Phase(name, timeout) for name, timeout in limits.items()]
         self.index = -1
         self.drift_distances: list[float] = []
@@ -180,7 +191,9 @@ class Scenario:
         if name == "drift":
             self._drift(elapsed)
             self.drift_distances.append(float(np.linalg.norm(box - self._goal)))
-        force = self._knock.force(now, box) if name == "knock" and self._knock and not self._knock.done else None
+        force = (
+            self._knock.force(now, box) if name == "knock" and self._knock and not self._knock.done else None
+        )
         self._watch(now, box, busy=force is not None)
         if not self.finished and self._over(now):
             self._enter(self.index + 1, now, box, tool)

@@ -83,7 +83,9 @@ def config_file(name: str) -> Path:
     for place in places:
         if (place / name).is_file():
             return place / name
-    raise ConfigurationError(f"{name} is in none of {', '.join(map(str, places))}; was the package installed completely?")
+    raise ConfigurationError(
+        f"{name} is in none of {', '.join(map(str, places))}; was the package installed completely?"
+    )
 
 
 def configured(default: Any, values: dict[str, Any]) -> Any:
@@ -102,7 +104,9 @@ def configured(default: Any, values: dict[str, Any]) -> Any:
     for name, value in values.items():
         head, _, rest = name.partition(".")
         if head not in fields:
-            raise ConfigurationError(f"{type(default).__name__} has no {head!r}; there are {', '.join(sorted(fields))}")
+            raise ConfigurationError(
+                f"{type(default).__name__} has no {head!r}; there are {', '.join(sorted(fields))}"
+            )
         if dataclasses.is_dataclass(getattr(default, head)):
             nested.setdefault(head, {}).update({rest: value} if rest else value)
         else:

@@ -1,4 +1,4 @@
-"""MCAP bags: written while a run goes on, read afterwards. Foxglove, PlotJuggler and ``ros2 bag`` open them as they are."""
+"""MCAP bags: written during a run, read afterwards. Foxglove and ``ros2 bag`` open them as they are."""
 
 from __future__ import annotations
 

@@ -37,12 +37,21 @@ def distance_chart(path: Path, recording: Recording, phases: Sequence[dict[str, 
     for phase in phases:
         begin = phase["start_s"]
         axes.axvline(begin - start, color=PLAIN, lw=0.7)
-        axes.text(begin - start, 1.02, " " + phase["name"], transform=axes.get_xaxis_transform(), fontsize=8, color=PLAIN)
+        axes.text(
+            begin - start,
+            1.02,
+            " " + phase["name"],
+            transform=axes.get_xaxis_transform(),
+            fontsize=8,
+            color=PLAIN,
+        )
     axes.set(xlabel="time [s]", ylabel="distance to target [mm]")
     canvas.savefig(path)
 
 
-def top_view(path: Path, recording: Recording, tool: NDArray[np.float64], corners: Sequence[NDArray[np.float64]]) -> None:
+def top_view(
+    path: Path, recording: Recording, tool: NDArray[np.float64], corners: Sequence[NDArray[np.float64]]
+) -> None:
     """Paths of object, target and tool on the table, seen from above.
 
     Args:
@@ -56,7 +65,9 @@ def top_view(path: Path, recording: Recording, tool: NDArray[np.float64], corner
     axes.plot(tool[:, 1], tool[:, 0], color=TOOL, lw=0.7, alpha=0.6, label="tool")
     axes.plot(pose[:, 1], pose[:, 0], color=BOX, lw=1.6, label="object")
     axes.plot(goal[:, 1], goal[:, 0], ".", color=TARGET, ms=2.5)
-    stops = goal[np.r_[True, np.linalg.norm(np.diff(goal[:, :2], axis=0), axis=1) > 0.03]] if len(goal) else goal
+    stops = (
+        goal[np.r_[True, np.linalg.norm(np.diff(goal[:, :2], axis=0), axis=1) > 0.03]] if len(goal) else goal
+    )
     axes.plot(stops[:, 1], stops[:, 0], "+", color=TARGET, ms=14, mew=2.2, label="target")
     for index, alpha in ((0, 0.35), (-1, 1.0)):
         if len(pose):
@@ -68,7 +79,9 @@ def top_view(path: Path, recording: Recording, tool: NDArray[np.float64], corner
     canvas.savefig(path)
 
 
-def _outline(axes: Any, pose: NDArray[np.float64], corners: Sequence[NDArray[np.float64]], alpha: float) -> None:
+def _outline(
+    axes: Any, pose: NDArray[np.float64], corners: Sequence[NDArray[np.float64]], alpha: float
+) -> None:
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     for polygon in corners:
         world = polygon @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
@@ -93,7 +106,9 @@ def joint_chart(path: Path, recording: Recording, limits: Limits, torque_limits:
         axes.set(ylabel=f"{name} [% of limit]", ylim=(-110, 110))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
-    upper.legend([f"joint {i + 1}" for i in range(joints.position.shape[1])], ncols=7, fontsize=7, frameon=False)
+    upper.legend(
+        [f"joint {i + 1}" for i in range(joints.position.shape[1])], ncols=7, fontsize=7, frameon=False
+    )
     lower.set_xlabel("time [s]")
     canvas.savefig(path)
 

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1f2937; max-width: 1040px; margin: 2rem auto; padding: 0 1rem; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #1f2937; }
+body { max-width: 1040px; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; margin-bottom: .4rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
 .verdict { padding: .7rem 1rem; border-radius: 6px; border-left: 6px solid; }
 .good { background: #ecfdf3; border-color: #2a9d4a; } .bad { background: #fef2f2; border-color: #b91c1c; }
-table { border-collapse: collapse; } td, th { padding: .25rem 1.2rem .25rem 0; text-align: left; border-bottom: 1px solid #e5e7eb; }
+table { border-collapse: collapse; }
+td, th { padding: .25rem 1.2rem .25rem 0; text-align: left; border-bottom: 1px solid #e5e7eb; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
 iframe { width: 100%; height: 560px; border: 1px solid #e5e7eb; border-radius: 6px; }
 img { width: 100%; } figure { margin: 1rem 0; } figcaption { color: #6b7280; font-size: .9rem; }
@@ -61,12 +63,21 @@ def demo_tables(summary: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]
     figures = [
         ["figure", "value"],
         ["final distance to the target", number(summary["final_error_m"], 1e3, "mm", 1)],
-        ["median distance while the target drifts at 2 cm/s", number(drift["median_distance_m"], 1e3, "mm", 1)],
+        [
+            "median distance while the target drifts at 2 cm/s",
+            number(drift["median_distance_m"], 1e3, "mm", 1),
+        ],
         ["limit violations", str(summary["limit_violations"])],
         ["largest deviation of the tool's height", number(summary["tool_height_deviation_m"], 1e3, "mm", 2)],
         ["plans per second", number(mpc["rate_hz"], 1.0, "Hz", 1)],
-        ["compute time p50 / p99 / max", " / ".join(number(compute[key], 1.0, "", 1) for key in compute) + " ms"],
-        ["deadlines missed", f"{number(mpc['deadline_misses'], 1.0, '', 0)} of {number(mpc['cycles'], 1.0, '', 0)}"],
+        [
+            "compute time p50 / p99 / max",
+            " / ".join(number(compute[key], 1.0, "", 1) for key in compute) + " ms",
+        ],
+        [
+            "deadlines missed",
+            f"{number(mpc['deadline_misses'], 1.0, '', 0)} of {number(mpc['cycles'], 1.0, '', 0)}",
+        ],
         ["from start to the first plan", number(summary["time_to_first_plan_s"], 1.0, "s", 1)],
         ["simulated time", number(summary["simulated_s"], 1.0, "s", 1)],
     ]
@@ -89,7 +100,10 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     lines = []
     for index, row in enumerate(rows):
         tag = "td" if index else "th"
-        cells = (f'<{tag}{" class=number" if column else ""}>{html.escape(cell)}</{tag}>' for column, cell in enumerate(row))
+        cells = (
+            f"<{tag}{' class=number' if column else ''}>{html.escape(cell)}</{tag}>"
+            for column, cell in enumerate(row)
+        )
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return f"<table>{''.join(lines)}</table>"
 
@@ -97,4 +111,5 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 def _figure(file: Path, caption: str) -> str:
     data = base64.b64encode(file.read_bytes()).decode("ascii")
     text = html.escape(caption)
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
+    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"

@@ -42,14 +42,14 @@ class PoseSeries:
         return np.stack(columns, axis=-1)
 
     def held(self, time: FloatArray) -> FloatArray:
-        """The latest pose (M, 3) at other times (M,): what a target that jumps was then; NaN before the first one."""
+        """The latest pose (M, 3) at other times (M,), for a target that jumps; NaN before the first."""
         index = np.searchsorted(self.time, time, side="right") - 1
         return np.where((index >= 0)[:, None], self.pose[np.maximum(index, 0)], np.nan)
 
 
 @dataclass(frozen=True)
 class JointSeries:
-    """Joint states over time: time (K,) [s], position [rad], velocity [rad/s] and effort [Nm], each (K, n)."""
+    """Joint states over time (K,) [s]: position [rad], velocity [rad/s] and effort [Nm], each (K, n)."""
 
     time: FloatArray
     position: FloatArray
@@ -111,7 +111,7 @@ class Recording:
         return reader.recording()
 
     def distance(self) -> tuple[FloatArray, FloatArray]:
-        """Distance between object and target over time: times (K,) [s] and distances (K,) [m], once there is a target."""
+        """Times (K,) [s] since there is a target, and the object's distances from it (K,) [m]."""
         goal = self.goal.held(self.object.time)
         distance = np.linalg.norm(self.object.pose[:, :2] - goal[:, :2], axis=1)
         known = np.isfinite(distance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import itertools
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -16,11 +17,17 @@ REMEDY = "apt install libegl1 libgl1 (or libosmesa6, and set MUJOCO_GL=osmesa)"
 
 
 def write_video(
-    path: Path, scene: Any, joint_names: Sequence[str], frames: Sequence[Frame], rate: float, camera: str = "overview"
+    path: Path,
+    scene: Any,
+    joint_names: Sequence[str],
+    frames: Sequence[Frame],
+    rate: float,
+    camera: str = "overview",
 ) -> str:
     """Render frames into an mp4 file.
 
-    OpenGL is chosen when MuJoCo is imported and may end a process that has no driver for it, hence a process of its own.
+    OpenGL is chosen when MuJoCo is imported and may end a process that has no driver for it, hence a process
+    of its own.
 
     Args:
         path: file to write.
@@ -39,7 +46,9 @@ def write_video(
     try:
         with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
             pool.submit(_render, path, scene, tuple(joint_names), list(frames), rate, camera).result()
-    except Exception as error:  # whatever a missing driver raises: AttributeError, ImportError, FatalError, a dead process
+    except (
+        Exception
+    ) as error:  # whatever a missing driver raises: AttributeError, ImportError, FatalError, a dead process
         path.unlink(missing_ok=True)
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         return f"no video: OpenGL is not available ({reason}); to get it: {REMEDY}"
@@ -49,7 +58,9 @@ def write_video(
     return ""
 
 
-def _render(path: Path, scene: Any, joint_names: Sequence[str], frames: list[Frame], rate: float, camera: str) -> None:
+def _render(
+    path: Path, scene: Any, joint_names: Sequence[str], frames: list[Frame], rate: float, camera: str
+) -> None:
     import imageio
     import mujoco
 
@@ -57,8 +68,14 @@ def _render(path: Path, scene: Any, joint_names: Sequence[str], frames: list[Fra
 
     model = build(scene)
     state = ModelState(model, joint_names)
-    options = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer, imageio.get_writer(path, fps=rate, **options) as writer:
+    options: dict[str, Any] = {
+        "codec": "libx264",
+        "quality": 7,
+        "macro_block_size": 2,
+        "ffmpeg_log_level": "error",
+    }
+    movie: Any = imageio.get_writer(path, fps=rate, **options)
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer, movie as writer:
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         for frame in frames:
             state.pose(frame)
@@ -77,7 +94,7 @@ def _draw_plan(scene: Any, frame: Frame) -> None:
     if frame.plan is None:
         return
     points = np.column_stack((frame.plan, np.full(len(frame.plan), 0.012)))[:: max(1, len(frame.plan) // 24)]
-    for begin, end in zip(points[:-1], points[1:], strict=True):
+    for begin, end in itertools.pairwise(points):
         if scene.ngeom >= scene.maxgeom:
             return
         geom = scene.geoms[scene.ngeom]

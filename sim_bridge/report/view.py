@@ -58,9 +58,11 @@ class ModelState:
         if frame.object_pose is not None:
             x, y, yaw = frame.object_pose
             qpos[start : start + 7] = (x, y, 0.0, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
-        known = frame.target is not None and bool(np.all(np.isfinite(frame.target[:2])))
-        # A target without orientation is drawn turned like the object; without a target it hides under the table.
-        self.data.mocap_pos[self._goal] = (*frame.target[:2], 0.0005) if known else (0.5, 0.0, -0.5)
+        # A target is drawn turned like the object, for it has no orientation; else it hides below the table.
+        place = (0.5, 0.0, -0.5)
+        if frame.target is not None and np.all(np.isfinite(frame.target[:2])):
+            place = (*frame.target[:2], 0.0005)
+        self.data.mocap_pos[self._goal] = place
         self.data.mocap_quat[self._goal] = qpos[start + 3 : start + 7]
         mujoco.mj_kinematics(self.model, self.data)
 
@@ -143,7 +145,9 @@ def open_server(port: int = 0) -> Any:
         return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
 
 
-def replay_page(model: mujoco.MjModel, joint_names: Sequence[str], frames: Iterable[Frame], rate: float) -> str:
+def replay_page(
+    model: mujoco.MjModel, joint_names: Sequence[str], frames: Iterable[Frame], rate: float
+) -> str:
     """A self-contained HTML page that plays a run and lets one look at it from all sides.
 
     Args:
@@ -176,7 +180,7 @@ def _move(handle: Any, position: FloatArray, wxyz: FloatArray) -> None:
 
 
 def _meshes(model: mujoco.MjModel, body: int) -> dict[tuple[int, int, int, int], Any]:
-    """The visible geometry of a body in the body's frame, joined by colour (red, green, blue, alpha from 0 to 255)."""
+    """The visible geometry of a body in the body's frame, joined by colour (red, green, blue, alpha)."""
     import trimesh
 
     parts: dict[tuple[int, int, int, int], list[Any]] = {}
