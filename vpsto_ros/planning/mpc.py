@@ -133,15 +133,8 @@ class OnlineVpsto:
             sigma = self.config.warm_sigma
         return search(
             problem.prior(n_via), problem.evaluate, self.config.search, self.rng,
-            means=self._starts(problem, guesses), seeds=guesses, sigma=sigma, deadline=deadline, clock=clock,
+            means=guesses, seeds=guesses, sigma=sigma, deadline=deadline, clock=clock,
         )  # fmt: skip
-
-    def _starts(self, problem: OnlineProblem, guesses: NDArray) -> NDArray:
-        """The guesses from which the search starts: as many as configured, the cheapest ones."""
-        count = self.config.search.starts
-        if len(guesses) <= count:
-            return guesses
-        return guesses[np.argsort(problem.evaluate(guesses).cost, kind="stable")[:count]]
 
     def _n_via(self, problem: OnlineProblem, mode: str) -> int:
         if mode == "explore" or self.config.via_rate == 0.0:
