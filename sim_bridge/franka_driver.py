@@ -139,8 +139,6 @@ class FrankaDriver(ManagedNode):
         """The present simulated time as a message."""
         return SIMULATED.stamp(self.simulation.time)
 
-    # The main thread.
-
     def spin(self, executor: Executor) -> None:
         """Step the simulation while another thread executes callbacks."""
         # A callback in Python may hold the interpreter for this long; the default is the length of a slice.
@@ -148,8 +146,18 @@ class FrankaDriver(ManagedNode):
         failures: list[BaseException] = []
         thread = threading.Thread(target=_spin_until_shutdown, args=(executor, failures), daemon=True)
         thread.start()
+        try:
+            self._run(thread)
+        finally:
+            executor.shutdown(timeout_sec=2.0)
+            thread.join(timeout=2.0)
+        if failures:
+            raise failures[0]
+
+    def _run(self, callbacks: threading.Thread) -> None:
+        """Advance whenever the node is active, for as long as callbacks are executed."""
         running = False
-        while rclpy.ok() and thread.is_alive():
+        while rclpy.ok() and callbacks.is_alive():
             if not (self.active and self.configured):
                 running = False
                 time.sleep(0.02)
@@ -158,8 +166,6 @@ class FrankaDriver(ManagedNode):
                 self.pacer.start(self.simulation.time)
                 running = True
             self.advance()
-        if failures:
-            raise failures[0]
 
     def advance(self) -> None:
         """One slice: requests, physics, messages, and a wait until its time has come."""
@@ -220,8 +226,6 @@ class FrankaDriver(ManagedNode):
     def _publish_markers(self) -> None:
         self._marker_publisher.publish(messages.scene_markers(self.simulation, self.config.base_frame))
 
-    # The executor's thread.
-
     def _ask(self, action: Callable[[], Any]) -> Future:
         """Let the main thread do something between two slices."""
         result: Future = Future()
@@ -232,7 +236,8 @@ class FrankaDriver(ManagedNode):
         try:
             points = read_trajectory(message, SIMULATED)
         except InvalidInputError as error:
-            raise TrajectoryRejected("shape", str(error)) from error
+            self.complaints.add("joint_trajectory.shape", f"trajectory refused (shape): {error}")
+            return
         command = TrajectoryCommand(**vars(points))
         self._ask(lambda: self._accept(command)).add_done_callback(self._complain)
 

@@ -185,7 +185,7 @@ def test_joint_states_are_reordered_and_checked():
     position, velocity = read_joint_state(message, NAMES[::-1])
     assert position.tolist() == q[::-1].tolist() and velocity.tolist() == qd[::-1].tolist()
     panda = JointState(name=["panda_joint1"], position=[0.0], velocity=[0.0])
-    with pytest.raises(InvalidInputError, match="no joint 'fr3_joint1'.*available: panda_joint1"):
+    with pytest.raises(InvalidInputError, match=r"no joint 'fr3_joint1'.*available: panda_joint1"):
         read_joint_state(panda, NAMES)
     with pytest.raises(InvalidInputError, match="0 entries of velocity for 1 joint"):
         read_joint_state(JointState(name=["a"], position=[0.0]), ["a"])

@@ -139,12 +139,14 @@ def read_trajectory(message: JointTrajectory, time_base: TimeBase = SIMULATED) -
     points, names = message.points, tuple(message.joint_names)
     if not points:
         raise InvalidInputError("the trajectory has no points")
+    positions = _column(points, "positions", len(names), required=True)
+    assert positions is not None
     now = message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0
     return TrajectoryPoints(
         joint_names=names,
         stamp=0.0 if now else time_base.seconds(message.header.stamp),
         time_from_start=np.array([_duration(point.time_from_start) for point in points]),
-        positions=_column(points, "positions", len(names), required=True),
+        positions=positions,
         velocities=_column(points, "velocities", len(names), partial=False),
         accelerations=_column(points, "accelerations", len(names)),
     )

@@ -1,6 +1,5 @@
 """The node that moves the arm: joint, object and contact states in, joint_trajectory out, at 20 to 50 Hz."""
 
-import collections
 import dataclasses
 import math
 import threading
@@ -9,7 +8,6 @@ import time
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
@@ -25,18 +23,14 @@ from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics, Dur
 from vpsto_ros.nodes.joint_conversions import read_joint_state, trajectory_message
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, latched, reliable, run
 from vpsto_ros.nodes.scene import ModelConfig, goal_on_table
+from vpsto_ros.nodes.sent_plans import JointSample, SentPlans, follows
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushing import MpcStep, PushingMpc, PushingMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
-from vpsto_ros.trajectory import Trajectory
 
 TRANSPORT = 0.004
 """What is left at least for the way from here to the controller [s]."""
-POSITION_MATCH = 1e-3
-"""The controller follows a plan if its reference is nearer than this [rad]."""
-VELOCITY_MATCH = 1e-2
-"""And its velocity nearer than this [rad/s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,56 +68,16 @@ class MpcPlannerConfig(NodeConfig):
         validate(self)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Joints:
-    stamp: float
-    position: NDArray
-    velocity: NDArray
-
-
-class _SentPlans:
-    """The plans sent lately, to find out which of them the controller really follows.
-
-    A careful controller refuses what comes too late; planning on from that would never fit again. Where the
-    controller publishes its reference (``desired_joint_states``), that says which plan runs.
-    """
-
-    def __init__(self, length: int = 12) -> None:
-        self._steps: collections.deque[MpcStep] = collections.deque(maxlen=length)
-
-    def add(self, step: MpcStep) -> None:
-        """Remember a plan that was sent."""
-        self._steps.append(step)
-
-    def running(self, desired: _Joints) -> MpcStep | None:
-        """The latest plan that leads through a reference state, None if none does."""
-        for step in reversed(self._steps):
-            if follows(step.trajectory, desired):
-                return step
-        return None
-
-
-def follows(trajectory: Trajectory, desired: _Joints) -> bool:
-    """Whether a trajectory passes through a reference state at its time."""
-    if desired.stamp < trajectory.start_time:
-        return False
-    position, velocity, _ = trajectory.state(desired.stamp)
-    position_error = np.abs(position - desired.position).max()
-    return bool(
-        position_error < POSITION_MATCH and np.abs(velocity - desired.velocity).max() < VELOCITY_MATCH
-    )
-
-
 class MpcPlannerNode(ManagedNode):
     """Runs the pushing planner against the clock and publishes what is ready in time.
 
-    Inputs are stored as they come; the planning timer, in a callback group of its own, takes the latest.
+    Inputs are stored as they come; the planning timer takes the latest. It has a callback group and a lock of
+    its own, so that the node also works in a multi-threaded executor; a single-threaded one makes it faster.
     The service ``~/stop`` (std_srvs/SetBool) brakes the arm and pauses planning with true, and resumes with
     false.
     """
 
     default_config = MpcPlannerConfig()
-    threads = 3
 
     def configure(self, config: MpcPlannerConfig) -> None:
         """Set up the planner, compile its kernels, then topics and timers."""
@@ -157,9 +111,9 @@ class MpcPlannerNode(ManagedNode):
 
     def on_time_reset(self) -> None:
         """Forget what carries a time; the goal stays."""
-        self.joints: _Joints | None = None
-        self.desired: _Joints | None = None
-        self._sent = _SentPlans()
+        self.joints: JointSample | None = None
+        self.desired: JointSample | None = None
+        self._sent = SentPlans()
         self.object: ObjectState | None = None
         self.contact: tuple[float, ContactPlan] | None = None
         self.last: MpcStep = MpcStep(None, "wait", False, "no joint_states yet")
@@ -257,10 +211,9 @@ class MpcPlannerNode(ManagedNode):
         contact = self.contact
         fresh = contact is not None and now - contact[0] <= config.contact_timeout
         deadline = begin + max(config.deadline - config.reserve, 0.0)
+        inputs = (now, position, joints.velocity, self.object, self.goal, contact[1] if fresh else None)
         try:
-            return self.planner.step(
-                now, position, joints.velocity, self.object, self.goal, contact[1] if fresh else None, deadline=deadline
-            )  # fmt: skip
+            return self.planner.step(*inputs, deadline=deadline)
         except VpstoError as error:
             # A state from which the planner finds no way: what was published last ends in a stop.
             self.complaints.add("planning", f"planning failed: {error}")
@@ -328,11 +281,11 @@ class MpcPlannerNode(ManagedNode):
 
     def _receive_joints(self, message: JointState) -> None:
         position, velocity = read_joint_state(message, self.robot.joint_names)
-        self.joints = _Joints(self.time_base.seconds(message.header.stamp), position, velocity)
+        self.joints = JointSample(self.time_base.seconds(message.header.stamp), position, velocity)
 
     def _receive_desired(self, message: JointState) -> None:
         position, velocity = read_joint_state(message, self.robot.joint_names)
-        self.desired = _Joints(self.time_base.seconds(message.header.stamp), position, velocity)
+        self.desired = JointSample(self.time_base.seconds(message.header.stamp), position, velocity)
 
     def _receive_object(self, message: Odometry) -> None:
         self.object = read_state(message, self.time_base, self.config.base_frame)

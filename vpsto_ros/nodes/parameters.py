@@ -48,9 +48,10 @@ def declare_parameters(node: Node, default: Any) -> None:
         ConfigurationError: for a name that does not exist, a value of the wrong type or one out of range.
     """
     options = {option.name: option for option in _options(default)}
+    present: dict[str, Any] = node.get_parameters_by_prefix("")
     overrides = {
         name: parameter.value
-        for name, parameter in node.get_parameters_by_prefix("").items()
+        for name, parameter in present.items()
         if name not in _FOREIGN and not name.startswith(_FOREIGN_PREFIXES)
     }
     for name in overrides:
