@@ -23,7 +23,11 @@ exit status: 0 success, 1 the run failed, 2 the command was not understood
 """
 
 DEMOS = {"push_box": "sim_bridge.demo.push_box"}
-EXPERIMENTS = {"push_box": "sim_bridge.experiments.push_box", "push_t": "sim_bridge.experiments.push_t"}
+EXPERIMENTS = {
+    "push_box": "sim_bridge.experiments.push_box",
+    "push_t": "sim_bridge.experiments.push_t",
+    "planning_space": "sim_bridge.experiments.planning_space",
+}
 
 
 def positive(text: str) -> float:

@@ -36,9 +36,12 @@ def _poses(rng: np.random.Generator) -> np.ndarray:
     return rng.uniform([0.46, -0.22, -np.pi], [0.60, 0.22, np.pi], (2, 3))
 
 
+THREE_MODELS = dataclasses.replace(CONFIG.costs, pressure_spread=0.25, friction_spread=0.6)
+
 VARIANTS = (
     Variant("vpsto", "VP-STO, free end point", CONFIG),
     Variant("thesis_end_point", "end point at the box centre", dataclasses.replace(CONFIG, costs=PushingCosts(end_point="object"))),
+    Variant("three_models", "averaged over three contact models", dataclasses.replace(CONFIG, costs=THREE_MODELS)),
     Variant("no_warm_start", "without warm start", dataclasses.replace(CONFIG, online=OnlineConfig(warm_start=False))),
     Variant("straight_push", "scripted straight push", CONFIG, StraightPushScript),
 )

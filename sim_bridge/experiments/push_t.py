@@ -40,12 +40,15 @@ def _poses(rng: np.random.Generator) -> np.ndarray:
     return rng.uniform([0.47, -0.18, -np.pi], [0.59, 0.18, np.pi], (2, 3))
 
 
+THREE_MODELS = dataclasses.replace(CONFIG.costs, pressure_spread=0.25, friction_spread=0.6)
+
 VARIANTS = (
     Variant("vpsto", "VP-STO, three starts", CONFIG),
     Variant(
         "one_start", "one start of the same budget",
         dataclasses.replace(CONFIG, online=OnlineConfig(search=VpstoConfig(population=72, iterations=5))),
     ),
+    Variant("three_models", "averaged over three contact models", dataclasses.replace(CONFIG, costs=THREE_MODELS)),
     Variant("no_warm_start", "without warm start", dataclasses.replace(CONFIG, online=dataclasses.replace(CONFIG.online, warm_start=False))),
 )  # fmt: skip
 

@@ -35,10 +35,10 @@ class PushingCosts:
         minimum=0.0, maximum=100.0,
     )  # fmt: skip
     pressure_spread: float = option(
-        0.25, "relative spread of the pressure radius in the three models over which costs are averaged", minimum=0.0, maximum=0.9
+        0.0, "relative spread of the pressure radius in the three models over which costs are averaged", minimum=0.0, maximum=0.9
     )
     friction_spread: float = option(
-        0.6, "relative spread of the tool's friction in those models; both 0: one model", minimum=0.0, maximum=1.0
+        0.0, "relative spread of the tool's friction in those models; both 0: one model", minimum=0.0, maximum=1.0
     )
     samples: int = option(64, "samples along a trajectory", minimum=8, maximum=1000)
     end_point: str = option("free", "where trajectories end: free, or at the object's centre as in the thesis", choices=("free", "object"))
