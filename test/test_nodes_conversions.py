@@ -151,6 +151,8 @@ def test_reading_a_trajectory_message():
     message = JointTrajectory(joint_names=["a", "b"])
     with pytest.raises(InvalidInputError, match="no points"):
         read_trajectory(message)
+    with pytest.raises(InvalidInputError, match="names no joints"):
+        read_trajectory(JointTrajectory(points=[JointTrajectoryPoint()]))
     message.points = points({"positions": [0.0, 1.0]}, {"positions": [1.0, 1.0], "accelerations": [2.0, 3.0]})
     read = read_trajectory(message)
     assert (read.joint_names, read.stamp, read.velocities) == (("a", "b"), 0.0, None)

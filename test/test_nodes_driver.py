@@ -20,7 +20,7 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import ReliabilityPolicy, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
@@ -443,3 +443,24 @@ def test_tickers_keep_their_rate_on_any_grid():
         and not ticker.due(1.005)
         and ticker.due(1.01)
     )
+
+
+def test_publishers_offer_what_their_readers_need(cell):
+    made = cell()
+    made.connect()
+    reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+    expected = {
+        "/clock": best_effort,
+        "/joint_states": reliable,
+        "/object_pose": reliable,
+        "/external_wrench": reliable,
+        "/franka_driver/ground_truth/object": best_effort,
+        "/franka_driver/markers": reliable,
+        "/diagnostics": reliable,
+    }
+    for topic, reliability in expected.items():
+        (info,) = made.helper.get_publishers_info_by_topic(topic)
+        assert info.qos_profile.reliability == reliability, topic
+    for topic in ("/joint_trajectory", "/disturbance"):
+        (info,) = made.helper.get_subscriptions_info_by_topic(topic)
+        assert info.qos_profile.reliability == best_effort, topic

@@ -140,7 +140,8 @@ def read_trajectory(message: JointTrajectory, time_base: TimeBase = SIMULATED) -
     if not points:
         raise InvalidInputError("the trajectory has no points")
     positions = _column(points, "positions", len(names), required=True)
-    assert positions is not None
+    if positions is None:
+        raise InvalidInputError("the trajectory names no joints")
     now = message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0
     return TrajectoryPoints(
         joint_names=names,
