@@ -119,6 +119,8 @@ def _run_nodes(arguments: argparse.Namespace, settings: Settings, bag: BagRecord
         for name, module in NODES.items():
             code = f"import sys; from {module} import main; sys.exit(main())"
             processes.start(name, [sys.executable, "-c", code, *settings.ros_arguments(name)])
+        # Whoever watches and records must not take time from those who plan and drive.
+        os.nice(5)
         with _observer(bag, scenario, environment) as observer:
             _wait_until_active(observer, processes)
             with _viewer(arguments.viewer, settings) as show:

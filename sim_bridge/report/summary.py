@@ -74,7 +74,7 @@ def limit_violations(recording: Recording, robot: Robot) -> dict[str, int]:
     """How often a limit was exceeded, by kind.
 
     Positions, velocities and torques count per joint state; a published trajectory counts when it
-    exceeds a position, velocity or acceleration limit at any instant. What the driver counted is added, but not
+    exceeds a position, velocity or acceleration limit at any instant. What the driver counted is added, not
     changes of torque that were asked for too fast: the controller cuts those before they reach the arm.
     """
     joints, limits = recording.joints, robot.limits
