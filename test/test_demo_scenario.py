@@ -94,28 +94,43 @@ def test_the_drift_has_its_speed_and_stays_in_the_area():
     assert np.any(np.diff(goals[:, 1]) > 0.0) and np.any(np.diff(goals[:, 1]) < 0.0)
 
 
-@pytest.mark.parametrize(("mass", "friction"), [(0.2, 0.2), (0.5, 0.35), (1.0, 0.6)])
-def test_the_hand_moves_any_box_by_about_the_distance_asked_for(mass, friction):
-    hand, distance = Knock(np.array([3.0, 4.0]), 0.07), 0.07
-    position, velocity, force, now = np.zeros(2), np.zeros(2), np.zeros(2), 0.0
+def shove(hand, mass, friction, period):
+    """Slide a box under a hand that is asked every `period()` seconds and lets go after 40 ms."""
+    position, velocity, force = np.zeros(2), np.zeros(2), np.zeros(2)
+    now, ask, let_go = 0.0, 0.0, 0.0
     while now < 5.0:
-        if round(now / 0.001) % 20 == 0:
-            force = hand.force(now, position)
-        speed = np.linalg.norm(velocity)
-        dry = friction * mass * 9.81
+        if now >= ask:
+            force, ask, let_go = hand.force(now, position.copy()), now + period(), now + 0.04
+        pushing = force if now < let_go else np.zeros(2)
+        speed, dry = np.linalg.norm(velocity), friction * mass * 9.81
         if speed > 1e-6:
             resistance = -dry * velocity / speed
         else:
-            resistance = -force * min(1.0, dry / max(np.linalg.norm(force), 1e-9))
-        new = velocity + 0.001 * (force + resistance) / mass
+            resistance = -pushing * min(1.0, dry / max(np.linalg.norm(pushing), 1e-9))
+        new = velocity + 0.001 * (pushing + resistance) / mass
         # Friction stops a box, it does not turn it round.
         velocity = np.zeros(2) if speed > 0.0 and new @ velocity < 0.0 else new
         position = position + 0.001 * velocity
         now += 0.001
+    return position
+
+
+@pytest.mark.parametrize(("mass", "friction"), [(0.2, 0.2), (0.5, 0.35), (1.0, 0.6)])
+def test_the_hand_moves_any_box_by_about_the_distance_asked_for(mass, friction):
+    hand = Knock(np.array([3.0, 4.0]), 0.07)
+    position = shove(hand, mass, friction, lambda: 0.02)
     assert hand.done
     assert 0.05 <= np.linalg.norm(position) <= 0.10
     assert position / np.linalg.norm(position) == pytest.approx([0.6, 0.8], abs=1e-6)
-    assert distance == hand.distance
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_hand_that_is_served_late_moves_the_box_no_farther_than_a_knock(seed):
+    rng = np.random.default_rng(seed)
+    hand = Knock(np.array([1.0, 0.0]), 0.075)
+    position = shove(hand, 0.5, 0.35, lambda: rng.choice([0.02, 0.05, 0.3], p=[0.6, 0.2, 0.2]))
+    assert hand.done
+    assert 0.05 <= np.linalg.norm(position) <= 0.12
 
 
 def test_the_knock_leaves_the_box_among_the_targets_and_off_the_tool():

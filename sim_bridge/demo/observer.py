@@ -107,6 +107,13 @@ class Observer(Node):
         message = self.latest(GROUND_TRUTH)
         return None if message is None else np.array(planar(message.pose.pose))
 
+    def planned_path(self) -> NDArray[np.float64] | None:
+        """The path of the tool's tip (P, 2) [m] in the newest trajectory, or None."""
+        message = self.latest(JOINT_TRAJECTORY)
+        if message is None or len(message.points) < 2:
+            return None
+        return forward_kinematics_batch([point.positions for point in message.points])[:, :2]
+
     def goal(self) -> NDArray[np.float64] | None:
         """The target's position (2,) [m], or None before the first one."""
         return self._goal

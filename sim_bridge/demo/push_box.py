@@ -227,7 +227,7 @@ def _viewer(wanted: bool, settings: Settings) -> Iterator[Any]:
     if not wanted:
         yield lambda observer: None
         return
-    from sim_bridge.report.view import CellView, Frame, open_server
+    from sim_bridge.report.view import CellView, Frame, close_server, open_server
     from sim_bridge.scene import build
 
     server = open_server()
@@ -239,12 +239,12 @@ def _viewer(wanted: bool, settings: Settings) -> Iterator[Any]:
     def show(observer: Observer) -> None:
         joints = observer.joints()
         if joints is not None:
-            view.show(Frame(joints, observer.object_pose(), observer.goal()))
+            view.show(Frame(joints, observer.object_pose(), observer.goal(), observer.planned_path()))
 
     try:
         yield show
     finally:
-        server.stop()
+        close_server(server)
 
 
 def _plain(value: Any) -> Any:

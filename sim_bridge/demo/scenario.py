@@ -12,6 +12,8 @@ REACHED_DISTANCE = 0.010
 HOLD_TIME = 1.0
 DRIFT_SPEED = 0.02
 DRIFT_MEDIAN_DISTANCE = 0.025
+LONGEST_STEP = 0.04
+"""How far the hand's force may grow without seeing what it does [s]."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class Knock:
     """
 
     def __init__(
-        self, direction: NDArray[np.float64], distance: float, speed: float = 0.25, force_limit: float = 20.0
+        self, direction: NDArray[np.float64], distance: float, speed: float = 0.25, force_limit: float = 8.0
     ):
         """Describe the shove.
 
@@ -79,7 +81,8 @@ class Knock:
             direction: where to, (2,), any length.
             distance: how far [m].
             speed: of the hand [m/s].
-            force_limit: the strongest force [N].
+            force_limit: the strongest force [N]. A stronger one could throw the box off the table when a busy
+                machine answers late.
         """
         self.direction = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
         self.distance, self.speed, self.force_limit = distance, speed, force_limit
@@ -102,7 +105,7 @@ class Knock:
         if self.done:
             return np.zeros(2)
         missing = self.speed - velocity
-        self._integral = min(self._integral + 80.0 * missing * elapsed, self.force_limit)
+        self._integral = min(self._integral + 80.0 * missing * min(elapsed, LONGEST_STEP), self.force_limit)
         return float(np.clip(10.0 * missing + self._integral, 0.0, self.force_limit)) * self.direction
 
 

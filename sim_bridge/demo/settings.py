@@ -15,6 +15,8 @@ from sim_bridge.scene import Scene
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.mpc_planner import MpcPlannerConfig
 
+HAND_HOLD = 0.04
+"""How long the hand presses on when nothing more is heard of it [s]: two of its periods."""
 SEEDED = ("franka_driver", "state_estimator", "mpc_planner")
 
 
@@ -66,7 +68,8 @@ class Settings:
             arguments += ["-p", f"seed:={self.seed}"]
         if node == "franka_driver":
             # A decimal point makes it a ROS double.
-            return [*arguments, "-p", f"real_time_factor:={self.real_time_factor:.6f}"]
+            arguments += ["-p", f"real_time_factor:={self.real_time_factor:.6f}"]
+            return [*arguments, "-p", f"disturbance_hold:={HAND_HOLD}"]
         return [*arguments, "-p", "use_sim_time:=true"]
 
 

@@ -145,6 +145,12 @@ def open_server(port: int = 0) -> Any:
         return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
 
 
+def close_server(server: Any) -> None:
+    """Stop a server without its farewell."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
 def replay_page(
     model: mujoco.MjModel, joint_names: Sequence[str], frames: Iterable[Frame], rate: float
 ) -> str:
@@ -167,8 +173,7 @@ def replay_page(
             view.show(frame)
         return serializer.as_html()
     finally:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+        close_server(server)
 
 
 def _move(handle: Any, position: FloatArray, wxyz: FloatArray) -> None:
