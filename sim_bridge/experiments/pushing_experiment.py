@@ -20,8 +20,6 @@ from vpsto_ros.planning.pushing import PushingMpc, PushingMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
 
 TOOL_RADIUS = 0.015
-ASSUMED_FRICTION = 0.3
-"""Tool friction in the planner's model; the objects have 0.1 to 0.5."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Variant:
 def run_variant(task: tuple[Variant, Trial]) -> TrialResult:
     """One closed-loop run of one variant."""
     variant, trial = task
-    model = PushingModel(trial.plant.shape, PlanarShape.disc(TOOL_RADIUS), friction=ASSUMED_FRICTION)
+    model = PushingModel(trial.plant.shape, PlanarShape.disc(TOOL_RADIUS))
     planner = variant.planner(variant.config, model, fr3_pusher(), np.random.default_rng([trial.seed, 2]))
     planner.warm_up()
     simulation = simulate(trial, start_joints(planner.table_map, trial.start, trial.plant.shape))

@@ -35,7 +35,7 @@ class PushingModel:
     shape: PlanarShape
     tool: PlanarShape
     pressure_radius: float | None = None
-    friction: float = 0.2
+    friction: float = 0.3
     center_of_friction: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

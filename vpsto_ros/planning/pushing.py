@@ -42,6 +42,7 @@ class PushingMpcConfig:
     hold_distance: float = option(0.002, "the goal counts as reached, and the arm rests, within", unit="m", minimum=1e-4, maximum=0.5)
     resume_distance: float = option(0.004, "a resting arm resumes when the object is farther off than", unit="m", minimum=1e-4, maximum=0.5)
     seeds: int = option(3, "straight pushes from different sides offered as first guesses", minimum=1, maximum=32)
+    contacts: int = option(24, "touch points tried along the outline for those", minimum=8, maximum=400)
     seed_separation: float = option(0.03, "distance between the touch points of those", unit="m", minimum=0.0, maximum=1.0)
     joint_tolerance: float = option(
         0.06, "the plan is begun anew when a joint is farther from its reference", unit="rad", minimum=1e-3, maximum=1.0
@@ -112,7 +113,7 @@ class PushingMpc:
         self.limits = Limits(np.full(2, config.speed), np.full(2, config.acceleration))
         self.online = OnlineVpsto(config.online, rng)
         costs = config.costs
-        self.ranking = PushRanking(0.8 * config.speed, costs.error, costs.rotation)
+        self.ranking = PushRanking(0.8 * config.speed, costs.error, costs.rotation, config.contacts)
         self.reset()
 
     def reset(self) -> None:
