@@ -57,7 +57,7 @@ class OnlineConfig:
     warm_start: bool = option(True, "start from what is left of the previous solution")
     warm_sigma: float = option(0.25, "initial step size when warm-starting, relative to the prior", minimum=1e-3, maximum=10.0)
     explore_sigma: float = option(1.0, "initial step size when exploring, relative to the prior", minimum=1e-3, maximum=10.0)
-    search: VpstoConfig = dataclasses.field(default_factory=VpstoConfig)
+    search: VpstoConfig = dataclasses.field(default_factory=lambda: VpstoConfig(population=24, iterations=5))
 
     def __post_init__(self) -> None:
         validate(self)
