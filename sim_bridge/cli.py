@@ -116,7 +116,7 @@ def _demo_arguments(parser: argparse.ArgumentParser, name: str) -> None:
         "--seed", type=seed, default=0, metavar="N", help="of camera noise and search (default 0)"
     )
     parser.add_argument(
-        "--duration", type=positive, default=60.0, metavar="S", help="simulated seconds at most (default 60)"
+        "--duration", type=positive, default=90.0, metavar="S", help="simulated seconds at most (default 90)"
     )
     parser.add_argument(
         "--out", default=f"output/{name}", metavar="DIR", help=f"results (default output/{name})"

@@ -52,7 +52,7 @@ def test_what_is_not_understood_exits_with_2_and_says_why(capsys, arguments, mes
 def test_defaults_of_the_demo():
     arguments = ["demo", "push_box"]
     parsed = cli.build_parser(arguments).parse_args(arguments)
-    assert (parsed.seed, parsed.duration, parsed.out) == (0, 60.0, "output/push_box")
+    assert (parsed.seed, parsed.duration, parsed.out) == (0, 90.0, "output/push_box")
     assert (parsed.viewer, parsed.real_time_factor) == (False, 1.0)
 
 

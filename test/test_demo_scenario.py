@@ -9,7 +9,7 @@ TOOL = np.array([0.4, 0.0])
 PERIOD = 0.02
 
 
-def act(scenario, follow, until=200.0):
+def act(scenario, follow, until=400.0):
     """Step a scenario; `follow(box, orders)` moves the box. Returns the orders over time."""
     box, now, history = np.array([0.5, 0.0]), 0.0, []
     while not scenario.finished and now < until:
@@ -86,7 +86,7 @@ def test_targets_are_in_the_area_and_a_jump_apart():
 
 
 def test_the_drift_has_its_speed_and_stays_in_the_area():
-    story = scenario(3, duration=200.0)
+    story = Scenario(np.random.default_rng(3), duration=300.0, drift_time=60.0)
     goals = np.array([orders.goal for _, orders, _ in act(story, obedient) if orders.goal_moves])
     speeds = np.linalg.norm(np.diff(goals, axis=0), axis=1) / PERIOD
     assert speeds == pytest.approx(DRIFT_SPEED, rel=1e-6)

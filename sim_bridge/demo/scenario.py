@@ -132,17 +132,20 @@ class Scenario:
 
     Attributes:
         rng: chooses the targets and the knock.
-        duration: the longest the scenario may take [s]; the drift takes a fifth of it.
+        duration: the longest the scenario may take [s].
+        drift_time: how long the target drifts [s], but at most a fifth of the duration.
         area: where targets are.
     """
 
     rng: np.random.Generator
-    duration: float = 60.0
+    duration: float = 90.0
+    drift_time: float = 12.0
     area: Area = field(default_factory=Area)
 
     def __post_init__(self) -> None:
         """Lay out the phases."""
-        jump, drift = 0.16 * self.duration, 0.2 * self.duration
+        drift = min(self.drift_time, 0.2 * self.duration)
+        jump = (self.duration - drift) / 5.0
         limits = {
             "target 1": jump,
             "target 2": jump,
