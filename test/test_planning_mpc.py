@@ -25,13 +25,22 @@ class RoundTheDisc:
 
     def evaluate(self, points):
         keys = self._keys(points)
-        motion = synthesize_batch(OptimalBasis.uniform(keys.shape[1] - 2), keys, self.velocity, np.zeros(2), LIMITS, 80)
+        motion = synthesize_batch(
+            OptimalBasis.uniform(keys.shape[1] - 2), keys, self.velocity, np.zeros(2), LIMITS, 80
+        )
         inside = (np.linalg.norm(motion.position - [0.5, 0.0], axis=2) < self.radius).sum(axis=1)
         return Evaluation(motion.duration + 10.0 * inside, inside == 0)
 
     def trajectory(self, points):
         keys = self._keys(points[None])[0]
-        return synthesize(OptimalBasis.uniform(len(keys) - 2), keys, self.velocity, np.zeros(2), LIMITS, start_time=self.start_time)
+        return synthesize(
+            OptimalBasis.uniform(len(keys) - 2),
+            keys,
+            self.velocity,
+            np.zeros(2),
+            LIMITS,
+            start_time=self.start_time,
+        )
 
     def direct(self, previous):
         return np.zeros((0, 2))
@@ -41,14 +50,18 @@ class RoundTheDisc:
         return previous(begin + (previous.end_time - begin) * np.arange(1, n_via + 1) / (n_via + 1))
 
     def prior(self, n_via):
-        return smoothness_prior(OptimalBasis.uniform(n_via), self.position, self.velocity, GOAL, np.zeros(2), 2.0, spread=0.3)
+        return smoothness_prior(
+            OptimalBasis.uniform(n_via), self.position, self.velocity, GOAL, np.zeros(2), 2.0, spread=0.3
+        )
 
     def guesses(self, n_via):
         return self.position + np.arange(1, n_via + 1)[None, :, None] / (n_via + 1) * (GOAL - self.position)
 
 
 def online(**options):
-    return OnlineVpsto(OnlineConfig(search=VpstoConfig(population=24, iterations=8), **options), np.random.default_rng(0))
+    return OnlineVpsto(
+        OnlineConfig(search=VpstoConfig(population=24, iterations=8), **options), np.random.default_rng(0)
+    )
 
 
 def test_explores_then_warm_starts_then_stops_without_touching_the_disc():

@@ -9,8 +9,10 @@ from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel, rollout
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.contact import ContactPlan, ContactPlannerConfig, PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
+from vpsto_ros.planning.mpc import OnlineConfig
 from vpsto_ros.planning.pushing import PushingMpc, PushingMpcConfig
 from vpsto_ros.planning.pushing_problem import PushingCosts, Workspace
 from vpsto_ros.robot.kinematics import fr3_pusher
@@ -27,7 +29,9 @@ class ModelPlant:
     def __init__(self, planner: PushingMpc, tool: np.ndarray, pose: np.ndarray, seed: int = 0) -> None:
         self.planner, self.pose, self.now = planner, pose, 0.0
         self.joints = planner.table_map.joints(tool[None])[0]
-        self.model = dataclasses.replace(planner.model, pressure_radius=1.2 * planner.model.pressure_radius, friction=0.35)
+        self.model = dataclasses.replace(
+            planner.model, pressure_radius=1.2 * planner.model.pressure_radius, friction=0.35
+        )
         self.rng = np.random.default_rng(seed)
         self.steps, self.published = [], []
 
@@ -35,7 +39,9 @@ class ModelPlant:
         noise = self.rng.normal(0.0, [1e-3, 1e-3, 5e-3])
         return ObjectState(self.now, self.pose + noise, np.zeros(3), 1e-6 * np.eye(6))
 
-    def advance(self, goal: PlanarGoal | None, contact: ContactPlan | None = None, state: ObjectState | None = None) -> None:
+    def advance(
+        self, goal: PlanarGoal | None, contact: ContactPlan | None = None, state: ObjectState | None = None
+    ) -> None:
         planner = self.planner
         if planner.reference is not None:
             self.joints = planner.reference(self.now)
@@ -158,10 +164,12 @@ def test_a_displaced_arm_is_taken_over_only_when_it_stands_still():
     for _ in range(10):
         plant.advance(GOAL)
     elsewhere = planner.table_map.joints(np.array([[0.38, 0.2]]))[0]
-    moving = planner.step(plant.now, elsewhere, np.full(7, 0.3), plant.state(), GOAL)
+    planner.accept(planner.step(plant.now, elsewhere, np.full(7, 0.3), plant.state(), GOAL))
+    later = planner.reference.end_time
+    moving = planner.step(later, elsewhere, np.full(7, 0.3), plant.state(), GOAL)
     assert moving.mode == "wait" and moving.trajectory is None and "stands still" in moving.message
-    still = planner.step(plant.now, elsewhere, np.zeros(7), plant.state(), GOAL)
-    assert still.trajectory is not None and still.trajectory.start_time > plant.now
+    still = planner.step(later, elsewhere, np.zeros(7), plant.state(), GOAL)
+    assert still.trajectory is not None and still.trajectory.start_time > later
     np.testing.assert_allclose(still.trajectory(still.trajectory.start_time), elsewhere)
 
 
@@ -169,7 +177,9 @@ def test_an_arm_above_the_table_is_lowered_beside_the_object():
     planner = make_planner()
     robot = planner.robot
     raised = type(planner.table_map)(robot, 0.3).joints(np.array([[0.45, -0.1]]))[0]
-    step = planner.step(0.0, raised, np.zeros(7), ObjectState(0.0, START, np.zeros(3), 1e-6 * np.eye(6)), GOAL)
+    step = planner.step(
+        0.0, raised, np.zeros(7), ObjectState(0.0, START, np.zeros(3), 1e-6 * np.eye(6)), GOAL
+    )
     assert step.mode == "enter" and not step.trajectory.violations(robot.limits)
     times = np.linspace(step.trajectory.start_time, step.trajectory.end_time, 300)
     tips = np.array([robot.forward(q)[0] for q in step.trajectory(times)])
@@ -221,10 +231,73 @@ def test_contact_plan_is_behind_the_object_and_well_defined():
         goal = PlanarGoal(rng.uniform([0.45, -0.2], [0.6, 0.2]))
         if np.hypot(*(goal.position - pose[:2])) < 0.05:
             continue
-        plan = planner.plan(1.0, np.array([0.4, 0.0]), ObjectState(1.0, pose, np.zeros(3), 1e-6 * np.eye(6)), goal)
+        plan = planner.plan(
+            1.0, np.array([0.4, 0.0]), ObjectState(1.0, pose, np.zeros(3), 1e-6 * np.eye(6)), goal
+        )
         assert plan.stamp >= 1.0 and np.linalg.eigvalsh(plan.covariance).min() > 0.0
         ahead = goal.position - pose[:2]
         assert (plan.position - pose[:2]) @ ahead < 0.0 and plan.velocity @ ahead > 0.0
         c, s = np.cos(pose[2]), np.sin(pose[2])
         in_object = np.array([[c, s], [-s, c]]) @ (plan.position - pose[:2])
         assert MODEL.shape.signed_distance(in_object[None])[0] >= 0.015
+
+
+@pytest.mark.parametrize("age", [0.05, 0.08, 0.12, 0.3])
+def test_an_old_object_state_is_brought_up_to_date_with_what_the_tool_did(age):
+    planner = make_planner()
+    plant = ModelPlant(planner, np.array([0.40, -0.05]), START)
+    plant.model = planner.model
+    history = {}
+    worst = 0.0
+    for _ in range(45):
+        history[round(plant.now, 3)] = plant.pose
+        plant.advance(GOAL)
+        then = round(plant.now - age, 3)
+        if then not in history or planner.reference is None:
+            continue
+        old = ObjectState(then, history[then], np.zeros(3), 1e-6 * np.eye(6))
+        worst = max(worst, np.hypot(*(planner._object_at(plant.now, old) - plant.pose)[:2]))
+    assert np.hypot(*(plant.pose - START)[:2]) > 0.02, "the object was pushed meanwhile"
+    assert worst < 5e-4
+
+
+def test_a_moving_arm_that_lags_far_behind_is_stopped_first():
+    planner = make_planner()
+    plant = ModelPlant(planner, np.array([0.40, -0.05]), START)
+    for _ in range(16):
+        plant.advance(GOAL)
+    lagging = planner.reference(plant.now) + np.array([0.0, 0.07, 0.0, 0.0, 0.0, 0.0, 0.0])
+    step = planner.step(plant.now, lagging, np.full(7, 0.2), plant.state(), GOAL)
+    assert step.mode == "brake" and "follow" in step.message
+    assert step.trajectory.end_time < plant.now + 1.0
+    assert_safe(planner, [*plant.published, step.trajectory])
+
+
+def test_a_reversed_workspace_is_an_error():
+    with pytest.raises(ConfigurationError, match=r"object_x = 0\.6, 0\.4"):
+        Workspace(object_x=(0.6, 0.4))
+    with pytest.raises(ConfigurationError, match="radius_min, radius_max"):
+        Workspace(radius_min=0.7, radius_max=0.4)
+
+
+def test_many_seeds_and_a_small_population_still_plan():
+    online = OnlineConfig(search=VpstoConfig(population=6, iterations=3))
+    planner = make_planner(seeds=12, online=online)
+    plant = ModelPlant(planner, np.array([0.40, -0.05]), START)
+    for _ in range(8):
+        plant.advance(GOAL)
+    assert plant.steps[-1].valid
+
+
+def test_the_contact_plan_says_where_and_which_way_to_push_first():
+    planner = make_planner()
+    plant = ModelPlant(planner, np.array([0.40, -0.05]), START)
+    for _ in range(5):
+        plant.advance(GOAL)
+    touch = np.array([0.53, -0.13])
+    plans = [ContactPlan(plant.now + 0.4, touch, velocity, 1e-4 * np.eye(2)) for velocity in np.array([[0.0, 0.3], [0.3, 0.0]])]
+    guesses = [planner._problem(plant.now, plant.pose, GOAL, plan).guesses(3)[0] for plan in plans]
+    for guess, direction in zip(guesses, np.array([[0.0, 1.0], [1.0, 0.0]]), strict=True):
+        np.testing.assert_allclose(guess[2], touch, atol=1e-9)
+        push = guess[3] - guess[2]
+        np.testing.assert_allclose(push / np.hypot(*push), direction, atol=1e-9)

@@ -38,21 +38,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print the table; 0 when the plane keeps the height in every candidate that it accepts."""
+    """Measure and print the table; 0 when the plane keeps the height about as often as the best space, and in 95 % at least."""
     rng = np.random.default_rng(arguments.seed)
     comparison = Comparison()
     moves = [comparison.move(*comparison.random_ends(rng), rng) for _ in range(arguments.runs)]
     rows = {name: summarise([move[name] for move in moves]) for name in SPACES}
     folder = pathlib.Path(arguments.out)
-    write_summary(folder, {"experiment": "planning_space", "seed": arguments.seed, "moves": arguments.runs, **rows})
-    header = ["search space", "variables", "tool within 5 mm", "height error, median / p99", "time for 32 candidates"]
+    write_summary(
+        folder, {"experiment": "planning_space", "seed": arguments.seed, "moves": arguments.runs, **rows}
+    )
+    header = [
+        "search space",
+        "variables",
+        "tool within 5 mm",
+        "height error, median / p99",
+        "time for 32 candidates",
+    ]
     table = markdown_table(header, [
         [SPACES[name], f"{N_VIA * (2 if name == 'plane' else 7)}", f"{100 * r['within']:.1f} %", f"{1e3 * r['error_p50']:.2f} / {1e3 * r['error_p99']:.2f} mm", f"{r['ms']:.2f} ms"]
         for name, r in rows.items()
     ])  # fmt: skip
     (folder / "table.md").write_text(table)
     print(f"{table}\nresults in {folder}")
-    good = rows["plane"]["error_max"] <= TOLERANCE
+    good = rows["plane"]["within"] >= max(0.95, rows["joints"]["within"], rows["projected"]["within"] - 0.05)
     print("verdict: " + ("passed" if good else "FAILED") + ": planning in the plane keeps the tool's height")
     return 0 if good else 1
 
@@ -65,7 +73,6 @@ def summarise(results: list[tuple[NDArray, float]]) -> dict[str, float | None]:
         "within": float((errors <= TOLERANCE).mean()),
         "error_p50": quantile(errors, 0.5),
         "error_p99": quantile(errors, 0.99),
-        "error_max": float(errors.max()),
         "ms": 1e3 * float(np.median([seconds for _, seconds in results])),
     }
 
@@ -85,10 +92,15 @@ class Comparison:
         """Two points of the tool's region, 10 to 40 cm apart, shape (2, 2) [m]."""
         while True:
             ends = rng.uniform([0.3, -0.35], [0.72, 0.35], (2, 2))
-            if 0.1 <= np.hypot(*(ends[1] - ends[0])) <= 0.4 and not self.workspace.tool_excess(ends[None]).any():
+            if (
+                0.1 <= np.hypot(*(ends[1] - ends[0])) <= 0.4
+                and not self.workspace.tool_excess(ends[None]).any()
+            ):
                 return ends
 
-    def move(self, start: NDArray, end: NDArray, rng: np.random.Generator) -> dict[str, tuple[NDArray, float]]:
+    def move(
+        self, start: NDArray, end: NDArray, rng: np.random.Generator
+    ) -> dict[str, tuple[NDArray, float]]:
         """Height errors [m] of the candidates and the time [s] to synthesise them, for each space."""
         joints = self.map.joints(np.stack([start, end]))
         jacobian = np.linalg.norm(self.map.jacobian(start[None])[0])
@@ -110,7 +122,9 @@ class Comparison:
         """What planning does with a population: synthesise it; in the plane, map the best candidate to joints."""
         if name == "plane":
             still = np.zeros(2)
-            synthesize_batch(self.basis, _between(ends, points), still, still, self.limits, SAMPLES, derivatives=False)
+            synthesize_batch(
+                self.basis, _between(ends, points), still, still, self.limits, SAMPLES, derivatives=False
+            )
             self._plane(ends, points[:1])
         else:
             self._heights(name, ends, points)
@@ -130,7 +144,9 @@ class Comparison:
 
     def _joints(self, ends: NDArray, points: NDArray) -> NDArray:
         still = np.zeros(7)
-        batch = synthesize_batch(self.basis, _between(ends, points), still, still, self.robot.limits, SAMPLES, derivatives=False)
+        batch = synthesize_batch(
+            self.basis, _between(ends, points), still, still, self.robot.limits, SAMPLES, derivatives=False
+        )
         heights = forward_kinematics_batch(batch.position.reshape(-1, 7))[:, 2].reshape(len(points), -1)
         return np.abs(heights - self.map.height).max(axis=1)
 
@@ -142,6 +158,9 @@ class Comparison:
             try:
                 joints = self.path.joints(motion, self.map.joints(ends[:1])[0], np.zeros(7))
             except InfeasibleError:
+                errors.append(
+                    np.inf
+                )  # the arm would leave the table or its limits: not a candidate that works
                 continue
             times = np.linspace(joints.start_time, joints.end_time, SAMPLES)
             errors.append(np.abs(forward_kinematics_batch(joints(times))[:, 2] - self.map.height).max())

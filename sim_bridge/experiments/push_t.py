@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from sim_bridge.experiments.pushing_experiment import PushingExperiment, Variant
+from sim_bridge.experiments.pushing_experiment import PushingExperiment, Targets, Variant
 from sim_bridge.experiments.pushing_trials import Trial, random_plant
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.optimization.vpsto import VpstoConfig
@@ -53,7 +53,11 @@ VARIANTS = (
 )  # fmt: skip
 
 EXPERIMENT = PushingExperiment(
-    name="push_t", title="Push a T: within 10 mm and 5 degrees, held 1 s, within 60 s", random_trial=random_trial, variants=VARIANTS
+    name="push_t",
+    title="Push a T: within 10 mm and 5 degrees, held 1 s, within 60 s",
+    random_trial=random_trial,
+    variants=VARIANTS,
+    targets=Targets(success_rate=0.95, replan_p99=0.040),
 )
 
 

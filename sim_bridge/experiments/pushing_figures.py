@@ -7,7 +7,9 @@ import numpy as np
 from sim_bridge.experiments.pushing_trials import Trial, TrialResult
 
 
-def write(folder: pathlib.Path, titles: dict[str, str], trials: list[Trial], results: dict[str, list[TrialResult]]) -> None:
+def write(
+    folder: pathlib.Path, titles: dict[str, str], trials: list[Trial], results: dict[str, list[TrialResult]]
+) -> None:
     """Write times.png (how many runs are done by when) and paths.png (what happened on the table) into a folder."""
     import matplotlib
 
@@ -22,8 +24,12 @@ def _times(path: pathlib.Path, titles: dict[str, str], results: dict[str, list[T
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     for name, runs in results.items():
         times = np.sort([run.time_to_goal for run in runs if run.success])
-        axes.step(np.append(0.0, times), np.arange(len(times) + 1) / len(runs), where="post", label=titles[name])
-    axes.set(xlabel="time to goal [s]", ylabel="share of runs at the goal", ylim=(0.0, 1.02), xlim=(0.0, None))
+        axes.step(
+            np.append(0.0, times), np.arange(len(times) + 1) / len(runs), where="post", label=titles[name]
+        )
+    axes.set(
+        xlabel="time to goal [s]", ylabel="share of runs at the goal", ylim=(0.0, 1.02), xlim=(0.0, None)
+    )
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
     figure.savefig(path, dpi=130)

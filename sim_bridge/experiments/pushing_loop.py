@@ -17,6 +17,7 @@ from vpsto_ros.estimation.planar_kalman import PlanarKalman
 from vpsto_ros.planning.contact import PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushing import MpcStep, PushingMpc
+from vpsto_ros.robot.kinematics import forward_kinematics_batch
 from vpsto_ros.trajectory import Trajectory
 
 
@@ -31,15 +32,17 @@ class Recording:
     mode: list[str] = dataclasses.field(default_factory=list)
     compute: list[float] = dataclasses.field(default_factory=list)
     rejected: list[str] = dataclasses.field(default_factory=list)
+    planned_height_error: float = 0.0
 
 
 def command_from(trajectory: Trajectory, joint_names: tuple[str, ...]) -> TrajectoryCommand:
-    """The message that carries a trajectory: knots with velocities, accelerations only where they do not jump."""
-    positions, velocities, accelerations = trajectory.knots()
+    """The message that carries a trajectory: knots with velocities and no accelerations, which a controller joins by cubics.
+
+    Every segment of a planned trajectory is a cubic, so that the controller reproduces it.
+    """
+    positions, velocities, _ = trajectory.knots()
     start = trajectory.start_time
-    return TrajectoryCommand(
-        joint_names, start, trajectory.times - start, positions, velocities, np.full_like(accelerations, np.nan)
-    )
+    return TrajectoryCommand(joint_names, start, trajectory.times - start, positions, velocities)
 
 
 class PushingLoop:
@@ -65,7 +68,12 @@ class PushingLoop:
             period: planning period [s].
             transport: time from the start of planning until the arm gets the plan [s].
         """
-        self.simulation, self.planner, self.contact_planner, self.goal = simulation, planner, contact_planner, goal
+        self.simulation, self.planner, self.contact_planner, self.goal = (
+            simulation,
+            planner,
+            contact_planner,
+            goal,
+        )
         self.period, self.transport = period, transport
         self.filter = PlanarKalman()
         self.recording = Recording()
@@ -89,28 +97,38 @@ class PushingLoop:
     def _plan(self) -> MpcStep:
         sim, now = self.simulation, self.simulation.time
         state, goal = self.filter.state, self.goal(now)
-        begin = time.perf_counter()
         contact = None
         if state is not None and self.contact_planner is not None:
             contact = self.contact_planner.plan(now, sim.tool_position()[:2], state, goal)
-        planning = time.perf_counter()
+        begin = time.perf_counter()
         step = self.planner.step(now, sim.joint_position, sim.joint_velocity, state, goal, contact)
-        self._record(now, goal, step, time.perf_counter() - planning, planning - begin)
+        self._record(now, goal, step, time.perf_counter() - begin)
         self._next_plan = now + self.period
         return step
 
     def _deliver(self, step: MpcStep) -> None:
+        self._check_height(step)
         try:
-            self.simulation.follower.accept(command_from(step.trajectory, self.planner.robot.joint_names), self.simulation.time)
+            self.simulation.follower.accept(
+                command_from(step.trajectory, self.planner.robot.joint_names), self.simulation.time
+            )
             self.planner.accept(step)
         except TrajectoryRejected as reason:
             self.recording.rejected.append(str(reason))
 
-    def _record(self, now: float, goal: PlanarGoal, step: MpcStep, planning: float, contact: float) -> None:
+    def _check_height(self, step: MpcStep) -> None:
+        """Largest deviation of the tool from its plane along what is published."""
+        trajectory = step.trajectory
+        times = np.linspace(trajectory.start_time, trajectory.end_time, 200)
+        heights = forward_kinematics_batch(trajectory(times))[:, 2]
+        error = float(np.abs(heights - self.planner.table_map.height).max())
+        self.recording.planned_height_error = max(self.recording.planned_height_error, error)
+
+    def _record(self, now: float, goal: PlanarGoal, step: MpcStep, compute: float) -> None:
         recording = self.recording
         recording.time.append(now)
         recording.object_pose.append(np.array(self.simulation.object_pose()))
         recording.tool.append(np.array(self.simulation.tool_position()))
         recording.goal.append(np.append(goal.position, np.nan if goal.yaw is None else goal.yaw))
         recording.mode.append(step.mode)
-        recording.compute.append(planning)
+        recording.compute.append(compute)

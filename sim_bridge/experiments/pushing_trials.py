@@ -16,6 +16,9 @@ from vpsto_ros.planning.pushing_problem import Workspace
 CHECK = 0.05
 """Period at which success is judged on the ground truth [s]."""
 
+KNOCK_MARGIN = 0.03
+"""A hand lets the object go at least so far from the border of the workspace [m]."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
@@ -67,6 +70,7 @@ class TrialResult:
     final_yaw_error: float
     limit_violations: int
     left_workspace: bool
+    planned_height_error: float
     tool_height_error: float
     rejected: int
     compute: tuple[float, ...]
@@ -88,14 +92,6 @@ def random_plant(shape: PlanarShape, offset_scale: NDArray, rng: np.random.Gener
     )
 
 
-def random_pose(workspace: Workspace, margin: float, rng: np.random.Generator) -> NDArray:
-    """A pose inside the objects' region, `margin` [m] away from its border, with any orientation."""
-    x, y = workspace.object_x, workspace.object_y
-    return np.array([
-        rng.uniform(x[0] + margin, x[1] - margin), rng.uniform(y[0] + margin, y[1] - margin), rng.uniform(-np.pi, np.pi)
-    ])  # fmt: skip
-
-
 def random_knock(rng: np.random.Generator) -> NDArray:
     """A displacement of 5-10 cm in any direction."""
     length, angle = rng.uniform(0.05, 0.10), rng.uniform(-np.pi, np.pi)
@@ -112,7 +108,9 @@ def start_joints(planner_map, object_pose: NDArray, shape: PlanarShape) -> NDArr
 
 def simulate(trial: Trial, joints: NDArray) -> Simulation:
     """The cell of a trial: camera 2 mm / 1 degree, 40 ms late, 5 % drop-outs."""
-    scene = Scene(plant=trial.plant, object_pose=tuple(trial.start.tolist()), start_joints=tuple(joints.tolist()))
+    scene = Scene(
+        plant=trial.plant, object_pose=tuple(trial.start.tolist()), start_joints=tuple(joints.tolist())
+    )
     return Simulation(scene, seed=trial.seed, camera=CameraConfig())
 
 
@@ -142,7 +140,8 @@ def run_trial(trial: Trial, loop: PushingLoop, workspace: Workspace) -> TrialRes
         seed=trial.seed, success=success, time_to_goal=reached_at - begin if success else None,
         time_to_goal_before_knock=before_knock,
         final_error=float(np.hypot(*(pose[:2] - trial.goal[:2]))), final_yaw_error=abs(float(wrap_angle(pose[2] - trial.goal[2]))),
-        limit_violations=sim.limits.violations, left_workspace=not inside, tool_height_error=sim.tool_height_deviation,
+        limit_violations=sim.limits.violations, left_workspace=not inside,
+        planned_height_error=record.planned_height_error, tool_height_error=sim.tool_height_deviation,
         rejected=len(record.rejected), compute=tuple(record.compute), modes=tuple(record.mode), times=np.array(record.time),
         object_path=np.array(record.object_pose), tool_path=np.array(record.tool),
     )  # fmt: skip
@@ -151,12 +150,13 @@ def run_trial(trial: Trial, loop: PushingLoop, workspace: Workspace) -> TrialRes
 def _knock(loop: PushingLoop, trial: Trial, workspace: Workspace) -> float:
     """Let a hand move the object, away from the border of the workspace; returns the time at which the hand lets go."""
     sim = loop.simulation
-    knock = trial.knock
-    after = np.asarray(sim.object_pose())[:2] + knock
-    middle = np.array([np.mean(workspace.object_x), np.mean(workspace.object_y)])
-    if not workspace.contains_object(np.append(after + 0.03 * np.sign(after - middle), 0.0)):
-        away = middle - np.asarray(sim.object_pose())[:2]
-        knock = np.hypot(*knock) * away / np.hypot(*away)
+    center, length = np.asarray(sim.object_pose())[:2], np.hypot(*trial.knock)
+    bearing = np.arctan2(trial.knock[1], trial.knock[0])
+    # The first direction, from the drawn one on, that ends well inside.
+    for turn in np.arange(0.0, 2.0 * np.pi, 0.1):
+        knock = length * np.array([np.cos(bearing + turn), np.sin(bearing + turn)])
+        if float(workspace.object_excess(np.append(center + knock, 0.0)[None], KNOCK_MARGIN)) == 0.0:
+            break
     sim.knock(knock, duration=0.25)
     loop.advance(0.25)
     return sim.time

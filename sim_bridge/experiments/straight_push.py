@@ -33,17 +33,25 @@ class StraightPushScript(PushingMpc):
         distance = float(np.hypot(*ahead))
         ahead = ahead / distance
         gap = self._half_depth(problem, ahead)
-        behind, aside = float((center - tool) @ ahead), abs(float(ahead[0] * (tool - center)[1] - ahead[1] * (tool - center)[0]))
+        behind, aside = (
+            float((center - tool) @ ahead),
+            abs(float(ahead[0] * (tool - center)[1] - ahead[1] * (tool - center)[0])),
+        )
         if behind > 0.5 * gap and aside < ALIGNED:
             return (tool + max(behind - gap + distance, 0.0) * ahead - problem.tool_offset)[None]
         touch = center - (gap + 0.015) * ahead
         radius = self.model.shape.bounding_radius + self.model.tool.bounding_radius + 0.015
-        return np.concatenate([around(tool, touch[None], center, radius, 2)[0], touch[None]]) - problem.tool_offset
+        return (
+            np.concatenate([around(tool, touch[None], center, radius, 2)[0], touch[None]])
+            - problem.tool_offset
+        )
 
     def _half_depth(self, problem: PushingProblem, ahead: NDArray) -> float:
         """Distance of the tool centre from the object's centre when it touches from behind."""
         lengths = np.linspace(0.0, self.model.shape.bounding_radius + self.model.tool.bounding_radius, 200)
         c, s = np.cos(problem.pose[2]), np.sin(problem.pose[2])
         backwards = -np.array([c * ahead[0] + s * ahead[1], -s * ahead[0] + c * ahead[1]])
-        free = self.model.shape.signed_distance(lengths[:, None] * backwards) >= self.model.tool.bounding_radius
+        free = (
+            self.model.shape.signed_distance(lengths[:, None] * backwards) >= self.model.tool.bounding_radius
+        )
         return float(lengths[free][0]) if free.any() else float(lengths[-1])

@@ -23,14 +23,26 @@ class ContactPlannerConfig:
     """Options of the contact planner."""
 
     speed: float = option(0.3, "speed at which the object is touched", unit="m/s", minimum=0.01, maximum=1.0)
-    error_cost: float = option(60.0, "seconds that one metre of remaining error is worth", unit="s/m", minimum=0.0, maximum=1e4)
+    error_cost: float = option(
+        60.0, "seconds that one metre of remaining error is worth", unit="s/m", minimum=0.0, maximum=1e4
+    )
     rotation_cost: float = option(
-        0.5, "seconds that one radian of rotation is worth if the goal has no orientation", unit="s/rad", minimum=0.0, maximum=1e3
+        0.5,
+        "seconds that one radian of rotation is worth if the goal has no orientation",
+        unit="s/rad",
+        minimum=0.0,
+        maximum=1e3,
     )
     contacts: int = option(40, "touch points tried along the outline", minimum=8, maximum=400)
-    temperature: float = option(0.3, "cost above the best at which a touch point still counts", unit="s", minimum=1e-3, maximum=10.0)
-    minimum_std: float = option(0.008, "smallest standard deviation of the touch point", unit="m", minimum=1e-4, maximum=0.2)
-    neighbourhood: float = option(0.05, "touch points farther from the best one do not count", unit="m", minimum=0.0, maximum=1.0)
+    temperature: float = option(
+        0.3, "cost above the best at which a touch point still counts", unit="s", minimum=1e-3, maximum=10.0
+    )
+    minimum_std: float = option(
+        0.008, "smallest standard deviation of the touch point", unit="m", minimum=1e-4, maximum=0.2
+    )
+    neighbourhood: float = option(
+        0.05, "touch points farther from the best one do not count", unit="m", minimum=0.0, maximum=1.0
+    )
 
     def __post_init__(self) -> None:
         validate(self)
@@ -93,4 +105,6 @@ class PushContactPlanner:
         velocity = config.speed * push / length if length > 1e-9 else np.zeros(2)
         radius = self.model.shape.bounding_radius + self.model.tool.bounding_radius
         travel = float(way_length(tool, best[None], pose[:2], radius)[0])
-        return ContactPlan(now + travel / config.speed, best, velocity, spread + config.minimum_std**2 * np.eye(2))
+        return ContactPlan(
+            now + travel / config.speed, best, velocity, spread + config.minimum_std**2 * np.eye(2)
+        )

@@ -49,14 +49,23 @@ class OnlineConfig:
 
     n_via: int = option(3, "largest number of via-points (N_max)", minimum=1, maximum=20)
     via_rate: float = option(
-        0.0, "via-points per second of remaining motion (alpha of 4.4.2); 0 keeps N_max", unit="1/s", minimum=0.0, maximum=100.0
+        0.0,
+        "via-points per second of remaining motion (alpha of 4.4.2); 0 keeps N_max",
+        unit="1/s",
+        minimum=0.0,
+        maximum=100.0,
     )
     stop_duration: float = option(
-        0.4, "a valid trajectory without via-points is taken when it is shorter (T_stop)", unit="s", minimum=0.0, maximum=10.0
+        0.4,
+        "a valid trajectory without via-points is taken when it is shorter (T_stop)",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
     )
     warm_start: bool = option(True, "start from what is left of the previous solution")
-    warm_sigma: float = option(0.25, "initial step size when warm-starting, relative to the prior", minimum=1e-3, maximum=10.0)
-    explore_sigma: float = option(1.0, "initial step size when exploring, relative to the prior", minimum=1e-3, maximum=10.0)
+    warm_sigma: float = option(
+        0.25, "initial step size when warm-starting, relative to the prior", minimum=1e-3, maximum=10.0
+    )
     search: VpstoConfig = dataclasses.field(default_factory=lambda: VpstoConfig(population=24, iterations=5))
 
     def __post_init__(self) -> None:
@@ -89,7 +98,11 @@ class OnlineVpsto:
         self.previous: Trajectory | None = None
 
     def step(
-        self, problem: OnlineProblem, *, deadline: float | None = None, clock: Callable[[], float] = time.perf_counter
+        self,
+        problem: OnlineProblem,
+        *,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> OnlineResult:
         """Plan once. Call :meth:`accept` when the result is going to be executed.
 
@@ -127,13 +140,13 @@ class OnlineVpsto:
         self, problem: OnlineProblem, mode: str, deadline: float | None, clock: Callable[[], float]
     ) -> SearchResult:
         n_via = self._n_via(problem, mode)
-        guesses, sigma = problem.guesses(n_via), self.config.explore_sigma
+        guesses, sigma = problem.guesses(n_via), self.config.search.sigma
         if mode == "warm_start":
             guesses = np.concatenate([problem.shifted(self.previous, n_via)[None], guesses])
             sigma = self.config.warm_sigma
         return search(
             problem.prior(n_via), problem.evaluate, self.config.search, self.rng,
-            means=guesses, seeds=guesses, sigma=sigma, deadline=deadline, clock=clock,
+            means=guesses, sigma=sigma, deadline=deadline, clock=clock,
         )  # fmt: skip
 
     def _n_via(self, problem: OnlineProblem, mode: str) -> int:

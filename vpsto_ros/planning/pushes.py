@@ -42,7 +42,11 @@ class StraightPushes:
         """The best pushes whose touch points are at least `separation` [m] apart, at most `count` of them."""
         chosen: list[int] = []
         for index in range(len(self)):
-            gaps = np.linalg.norm(self.touch[chosen] - self.touch[index], axis=1) if chosen else np.array([np.inf])
+            gaps = (
+                np.linalg.norm(self.touch[chosen] - self.touch[index], axis=1)
+                if chosen
+                else np.array([np.inf])
+            )
             if gaps.min() >= separation:
                 chosen.append(index)
             if len(chosen) == count:
@@ -92,7 +96,10 @@ def around(start: NDArray, touch: NDArray, center: NDArray, radius: float, count
 
 def way_length(start: NDArray, touch: NDArray, center: NDArray, radius: float) -> NDArray:
     """Length of the way of :func:`around`, shape (S,) [m]."""
-    way = np.concatenate([np.broadcast_to(start, (len(touch), 1, 2)), around(start, touch, center, radius, 6), touch[:, None]], 1)
+    way = np.concatenate(
+        [np.broadcast_to(start, (len(touch), 1, 2)), around(start, touch, center, radius, 6), touch[:, None]],
+        1,
+    )
     return np.linalg.norm(np.diff(way, axis=1), axis=2).sum(axis=1)
 
 

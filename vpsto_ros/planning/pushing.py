@@ -35,19 +35,47 @@ AT_REST = 0.02
 class PushingMpcConfig:
     """Options of the pushing planner."""
 
-    lead: float = option(0.05, "time between the start of planning and the moment the plan takes over", unit="s", minimum=0.005, maximum=1.0)
-    speed: float = option(0.35, "largest tool speed in x and in y", unit="m/s", minimum=0.01, maximum=2.0)
-    acceleration: float = option(1.8, "largest tool acceleration in x and in y", unit="m/s^2", minimum=0.05, maximum=20.0)
-    tool_height: float = option(0.02, "height of the tool's tip above the table", unit="m", minimum=0.002, maximum=0.5)
-    hold_distance: float = option(0.002, "the goal counts as reached, and the arm rests, within", unit="m", minimum=1e-4, maximum=0.5)
-    resume_distance: float = option(0.004, "a resting arm resumes when the object is farther off than", unit="m", minimum=1e-4, maximum=0.5)
-    seeds: int = option(3, "straight pushes from different sides offered as first guesses", minimum=1, maximum=32)
-    contacts: int = option(24, "touch points tried along the outline for those", minimum=8, maximum=400)
-    seed_separation: float = option(0.03, "distance between the touch points of those", unit="m", minimum=0.0, maximum=1.0)
-    joint_tolerance: float = option(
-        0.06, "the plan is begun anew when a joint is farther from its reference", unit="rad", minimum=1e-3, maximum=1.0
+    lead: float = option(
+        0.05,
+        "time between the start of planning and the moment the plan takes over",
+        unit="s",
+        minimum=0.005,
+        maximum=1.0,
     )
-    object_timeout: float = option(0.5, "the arm stops when the object's state is older", unit="s", minimum=0.02, maximum=10.0)
+    speed: float = option(0.35, "largest tool speed in x and in y", unit="m/s", minimum=0.01, maximum=2.0)
+    acceleration: float = option(
+        1.8, "largest tool acceleration in x and in y", unit="m/s^2", minimum=0.05, maximum=20.0
+    )
+    tool_height: float = option(
+        0.02, "height of the tool's tip above the table", unit="m", minimum=0.002, maximum=0.5
+    )
+    hold_distance: float = option(
+        0.002, "the goal counts as reached, and the arm rests, within", unit="m", minimum=1e-4, maximum=0.5
+    )
+    resume_distance: float = option(
+        0.004,
+        "a resting arm resumes when the object is farther off than",
+        unit="m",
+        minimum=1e-4,
+        maximum=0.5,
+    )
+    seeds: int = option(
+        3, "straight pushes from different sides offered as first guesses", minimum=1, maximum=32
+    )
+    contacts: int = option(24, "touch points tried along the outline for those", minimum=8, maximum=400)
+    seed_separation: float = option(
+        0.03, "distance between the touch points of those", unit="m", minimum=0.0, maximum=1.0
+    )
+    joint_tolerance: float = option(
+        0.06,
+        "the plan is begun anew when a joint is farther from its reference",
+        unit="rad",
+        minimum=1e-3,
+        maximum=1.0,
+    )
+    object_timeout: float = option(
+        0.5, "the arm stops when the object's state is older", unit="s", minimum=0.02, maximum=10.0
+    )
     costs: PushingCosts = dataclasses.field(default_factory=PushingCosts)
     workspace: Workspace = dataclasses.field(default_factory=Workspace)
     online: OnlineConfig = dataclasses.field(default_factory=OnlineConfig)
@@ -94,7 +122,9 @@ class MpcStep:
 class PushingMpc:
     """Plans, 20 to 50 times a second, how the arm pushes an object to a goal."""
 
-    def __init__(self, config: PushingMpcConfig, model: PushingModel, robot: Robot, rng: np.random.Generator) -> None:
+    def __init__(
+        self, config: PushingMpcConfig, model: PushingModel, robot: Robot, rng: np.random.Generator
+    ) -> None:
         """Set up the planner.
 
         Args:
@@ -104,7 +134,10 @@ class PushingMpc:
             rng: source of all randomness.
 
         Raises:
-            ConfigurationError: speed, acceleration and workspace are beyond what the joints can do.
+            ConfigurationError: the workspace is beyond what the arm reaches.
+
+        Speed and acceleration are the tool's, in every place and direction. Near the far rim the joints can ask for less:
+        the joint trajectory is then slower than the plane motion (see :class:`TablePath`), and the step's message says so.
         """
         self.config, self.model, self.robot = config, model, robot
         table_map = TableMap(robot, config.tool_height)
@@ -154,6 +187,10 @@ class PushingMpc:
             clock: source of that time.
         """
         if self._lost(now, joint_position):
+            if self._reference_moves(now):
+                return self._stop(
+                    now, "brake", "the arm does not follow its reference; stopping before planning anew"
+                )
             return self._begin(now, joint_position, joint_velocity, object_state)
         if now + self.config.lead < self.ready_at:
             return MpcStep(None, "wait", False, "on the way to where planning begins")
@@ -169,7 +206,7 @@ class PushingMpc:
     def accept(self, step: MpcStep) -> None:
         """Take note that a step's trajectory is being executed."""
         if step.trajectory is not None:
-            self.reference = step.trajectory
+            self.reference = self._with_past(step.trajectory)
             self.online.accept(step.plane)
             self.ready_at = step.ready_at
 
@@ -179,8 +216,9 @@ class PushingMpc:
             return None
         position, velocity, _ = self.reference.state(now)
         self.online.accept(None)
-        self.reference = extended(braking_trajectory(position, velocity, self.robot.limits, start_time=now), now + 0.5)
-        return self.reference
+        brake = extended(braking_trajectory(position, velocity, self.robot.limits, start_time=now), now + 0.5)
+        self.reference = self._with_past(brake)
+        return brake
 
     def warm_up(self) -> None:
         """Compile every kernel by planning once for an imaginary object."""
@@ -190,7 +228,15 @@ class PushingMpc:
         still = np.zeros_like(joints)
         for yaw in (None, 0.5):
             for now in (0.0, 0.3, 0.35):
-                self.accept(self.step(now, joints, still, dataclasses.replace(state, stamp=now), PlanarGoal(np.array([0.55, 0.1]), yaw)))
+                self.accept(
+                    self.step(
+                        now,
+                        joints,
+                        still,
+                        dataclasses.replace(state, stamp=now),
+                        PlanarGoal(np.array([0.55, 0.1]), yaw),
+                    )
+                )
             self.stop(0.5)
             self.reset()
 
@@ -200,11 +246,27 @@ class PushingMpc:
             return True
         return bool(np.abs(self.reference(now) - joint_position).max() > self.config.joint_tolerance)
 
+    def _reference_moves(self, now: float) -> bool:
+        return self.reference is not None and np.abs(self.reference(now + self.config.lead, 1)).max() > 1e-6
+
+    def _with_past(self, trajectory: Trajectory) -> Trajectory:
+        """A trajectory preceded by what was executed before it, as far back as an object state may date."""
+        if self.reference is None or self.reference.start_time >= trajectory.start_time:
+            return trajectory
+        begin = max(self.reference.start_time, trajectory.start_time - self.config.object_timeout)
+        past = extended(self.reference, trajectory.start_time).clipped(begin, trajectory.start_time)
+        return past.followed_by(trajectory)
+
     def _begin(self, now: float, position: NDArray, velocity: NDArray, state: ObjectState | None) -> MpcStep:
         """Take over an arm that stands still; one that is not in the plane is moved there first."""
         self.reset()
         if np.abs(velocity).max() > AT_REST:
-            return MpcStep(None, "wait", False, "the arm moves but not by this planner's reference; waiting until it stands still")
+            return MpcStep(
+                None,
+                "wait",
+                False,
+                "the arm moves but not by this planner's reference; waiting until it stands still",
+            )
         deviation = np.abs(self.table_map.joints(self.table_map.tool(position)[None])[0] - position).max()
         height = abs(float(self.robot.forward(position)[0][2]) - self.table_map.height)
         if not deviation < self.config.joint_tolerance or height > 2.0 * self.table_path.height_tolerance:
@@ -214,8 +276,13 @@ class PushingMpc:
         return MpcStep(rest, "wait", False, "took over the arm where it stands", ready_at=start)
 
     def _enter_plane(self, now: float, position: NDArray, state: ObjectState | None) -> MpcStep:
-        if state is None:
-            return MpcStep(None, "wait", False, "the tool is not in its plane; lowering it needs the object's state")
+        if state is None or now - state.stamp > self.config.object_timeout:
+            return MpcStep(
+                None,
+                "wait",
+                False,
+                "the tool is not in its plane; lowering it needs a fresh state of the object",
+            )
         config, start = self.config, now + 4.0 * self.config.lead
         try:
             motion = enter_plane(self.table_path, self.model, config.workspace, position, state.pose, start)
@@ -252,7 +319,13 @@ class PushingMpc:
         return self.holding
 
     def _plan(
-        self, now: float, pose: NDArray, goal: PlanarGoal, contact: ContactPlan | None, deadline: float | None, clock: Callable[[], float]
+        self,
+        now: float,
+        pose: NDArray,
+        goal: PlanarGoal,
+        contact: ContactPlan | None,
+        deadline: float | None,
+        clock: Callable[[], float],
     ) -> MpcStep:
         problem = self._problem(now, pose, goal, contact)
         result = self.online.step(problem, deadline=deadline, clock=clock)
@@ -263,7 +336,9 @@ class PushingMpc:
         except InfeasibleError as error:
             return self._stop(now, "brake", f"plan refused: {error}")
 
-    def _problem(self, now: float, pose: NDArray, goal: PlanarGoal, contact: ContactPlan | None) -> PushingProblem:
+    def _problem(
+        self, now: float, pose: NDArray, goal: PlanarGoal, contact: ContactPlan | None
+    ) -> PushingProblem:
         takeover = now + self.config.lead
         position, velocity, _ = self.reference.state(takeover)
         tool = self.table_map.tool(position)
@@ -283,17 +358,29 @@ class PushingMpc:
         keys = plane(np.linspace(plane.start_time, plane.end_time, 40))
         poses = rollout(self.model, problem.pose, (keys + self.tool_offset)[None]).object_pose[0]
         iterations = result.search.iterations if result.search else 0
-        trajectory = self._joined(now, joints)
-        return MpcStep(trajectory, result.mode, True, "pushing", result.cost, keys, poses, iterations, plane)
+        stretch = joints.duration / plane.duration
+        message = (
+            "pushing"
+            if stretch < 1.0 + 1e-9
+            else f"pushing, {stretch:.2f} times slower for the joints' limits"
+        )
+        return MpcStep(
+            self._joined(now, joints), result.mode, True, message, result.cost, keys, poses, iterations,
+            plane if stretch < 1.05 else None,
+        )  # fmt: skip
 
     def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
         """Come to rest gently: in the plane, a straight line with constant deceleration (a free end without via-points)."""
         takeover = now + self.config.lead
         position, velocity, _ = self.reference.state(takeover)
         if np.abs(velocity).max() < 1e-6:
-            return MpcStep(self._joined(now, resting(position, takeover, takeover + 0.5)), mode, valid, message)
+            return MpcStep(
+                self._joined(now, resting(position, takeover, takeover + 0.5)), mode, valid, message
+            )
         tool = self.table_map.tool(position)
-        plane = braking_trajectory(tool, self.table_map.tool_velocity(position, velocity), self.limits, start_time=takeover)
+        plane = braking_trajectory(
+            tool, self.table_map.tool_velocity(position, velocity), self.limits, start_time=takeover
+        )
         try:
             joints = self.table_path.joints(plane, position, velocity)
         except InfeasibleError:

@@ -7,13 +7,21 @@ from numpy.typing import NDArray
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.contact.pushing import PushingModel, rollout
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.optimization.vpsto import Evaluation
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushes import StraightPushes, around
 from vpsto_ros.priors.contact import contact_factor
 from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
-from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, TrajectoryBatch, synthesize, synthesize_batch
+from vpsto_ros.trajectory import (
+    Limits,
+    OptimalBasis,
+    Trajectory,
+    TrajectoryBatch,
+    synthesize,
+    synthesize_batch,
+)
 
 INVALID_COST = 100.0
 """Offset that ranks every invalid candidate behind the valid ones."""
@@ -23,25 +31,51 @@ INVALID_COST = 100.0
 class PushingCosts:
     """Weights and limits of the pushing objective."""
 
-    error: float = option(60.0, "seconds that one metre of remaining error is worth", unit="s/m", minimum=0.0, maximum=1e4)
-    rotation: float = option(
-        0.5, "seconds that one radian of rotation is worth if the goal has no orientation", unit="s/rad", minimum=0.0, maximum=1e3
+    error: float = option(
+        60.0, "seconds that one metre of remaining error is worth", unit="s/m", minimum=0.0, maximum=1e4
     )
-    smoothness: float = option(0.0, "weight of the squared acceleration, per limit squared and second", minimum=0.0, maximum=1e3)
-    horizon: float = option(6.0, "longest trajectory that counts as valid", unit="s", minimum=0.5, maximum=60.0)
-    minimum_gain: float = option(0.0005, "smallest reduction of the error that makes a candidate valid", unit="m", minimum=0.0, maximum=1.0)
+    rotation: float = option(
+        0.5,
+        "seconds that one radian of rotation is worth if the goal has no orientation",
+        unit="s/rad",
+        minimum=0.0,
+        maximum=1e3,
+    )
+    smoothness: float = option(
+        0.0, "weight of the squared acceleration, per limit squared and second", minimum=0.0, maximum=1e3
+    )
+    horizon: float = option(
+        6.0, "longest trajectory that counts as valid", unit="s", minimum=0.5, maximum=60.0
+    )
+    minimum_gain: float = option(
+        0.0005,
+        "smallest reduction of the error that makes a candidate valid",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+    )
     regress: float = option(
         2.0, "how much more an increase of the error on the way costs than error at the end; keeps the tool from dragging the object along",
         minimum=0.0, maximum=100.0,
     )  # fmt: skip
     pressure_spread: float = option(
-        0.0, "relative spread of the pressure radius in the three models over which costs are averaged", minimum=0.0, maximum=0.9
+        0.0,
+        "relative spread of the pressure radius in the three models over which costs are averaged",
+        minimum=0.0,
+        maximum=0.9,
     )
     friction_spread: float = option(
-        0.0, "relative spread of the tool's friction in those models; both 0: one model", minimum=0.0, maximum=1.0
+        0.0,
+        "relative spread of the tool's friction in those models; both 0: one model",
+        minimum=0.0,
+        maximum=1.0,
     )
     samples: int = option(64, "samples along a trajectory", minimum=8, maximum=1000)
-    end_point: str = option("free", "where trajectories end: free, or at the object's centre as in the thesis", choices=("free", "object"))
+    end_point: str = option(
+        "free",
+        "where trajectories end: free, or at the object's centre as in the thesis",
+        choices=("free", "object"),
+    )
 
     def __post_init__(self) -> None:
         validate(self)
@@ -51,20 +85,44 @@ class PushingCosts:
 class Workspace:
     """Where the tool and the object may be, base frame [m]."""
 
-    radius_min: float = option(0.305, "smallest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
-    radius_max: float = option(0.76, "largest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0)
+    radius_min: float = option(
+        0.305, "smallest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0
+    )
+    radius_max: float = option(
+        0.76, "largest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0
+    )
     side: float = option(0.45, "the tool stays within +- side in y", unit="m", minimum=0.0, maximum=2.0)
-    object_x: tuple[float, float] = option((0.40, 0.64), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0)
-    margin: float = option(0.02, "distance from the border that plans keep for objects that need not come nearer", unit="m", minimum=0.0, maximum=0.2)
-    object_y: tuple[float, float] = option((-0.32, 0.32), "range of the object's origin in y", unit="m", minimum=-2.0, maximum=2.0)
+    object_x: tuple[float, float] = option(
+        (0.40, 0.64), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0
+    )
+    margin: float = option(
+        0.02,
+        "distance from the border that plans keep for objects that need not come nearer",
+        unit="m",
+        minimum=0.0,
+        maximum=0.2,
+    )
+    object_y: tuple[float, float] = option(
+        (-0.32, 0.32), "range of the object's origin in y", unit="m", minimum=-2.0, maximum=2.0
+    )
 
     def __post_init__(self) -> None:
         validate(self)
+        room = 2.0 * self.margin
+        for name, (low, high) in {
+            "radius_min, radius_max": (self.radius_min, self.radius_max), "object_x": self.object_x, "object_y": self.object_y
+        }.items():  # fmt: skip
+            if high - low <= room:
+                raise ConfigurationError(
+                    f"Workspace.{name} = {low}, {high} leaves no room; the second must exceed the first by more than 2 margin = {room}"
+                )
 
     def tool_excess(self, path: NDArray) -> NDArray:
         """How far tool paths (B, K, 2) leave their region, shape (B,) [m]; 0 inside."""
         radius = np.sqrt(np.einsum("bki,bki->bk", path, path))
-        beyond = np.maximum(np.maximum(self.radius_min - radius, radius - self.radius_max), np.abs(path[..., 1]) - self.side)
+        beyond = np.maximum(
+            np.maximum(self.radius_min - radius, radius - self.radius_max), np.abs(path[..., 1]) - self.side
+        )
         behind = 0.1 - path[..., 0]
         return np.maximum(np.maximum(beyond, behind).max(axis=1), 0.0)
 
@@ -147,7 +205,7 @@ class PushingProblem:
         # An object that is near or beyond the border must be allowed to come back, and to go to a goal that is there.
         ends = np.stack([pose, np.append(goal.position, 0.0)])[:, None]
         self._allowed_excess = float(workspace.object_excess(ends, workspace.margin).max()) + 1e-3
-        self._fixed_end = pose[:2] if costs.end_point == "object" else None
+        self._fixed_end = pose[:2] - tool_offset if costs.end_point == "object" else None
 
     def evaluate(self, points: NDArray) -> Evaluation:
         """Costs [s] and validity of candidates (B, P, 2): error, regress, T, rotation, smoothness; see :class:`PushingCosts`."""
@@ -177,8 +235,12 @@ class PushingProblem:
         regress = np.maximum(np.diff(errors, axis=-1), 0.0).sum(axis=-1).mean(axis=0)
         rotation = np.abs(poses[:, :, -1, 2] - self.pose[2]).mean(axis=0)
         leaves = self.workspace.object_excess(poses, self.workspace.margin).max(axis=0)
-        excess = np.maximum(self.workspace.tool_excess(motion.position), np.maximum(leaves - self._allowed_excess, 0.0))
-        return PushOutcome(motion, poses[len(poses) // 2], errors[..., -1].mean(axis=0), regress, rotation, excess)
+        excess = np.maximum(
+            self.workspace.tool_excess(motion.position), np.maximum(leaves - self._allowed_excess, 0.0)
+        )
+        return PushOutcome(
+            motion, poses[len(poses) // 2], errors[..., -1].mean(axis=0), regress, rotation, excess
+        )
 
     def trajectory(self, points: NDArray) -> Trajectory:
         """The timed plane trajectory of one candidate (P, 2)."""
@@ -204,20 +266,42 @@ class PushingProblem:
         radius = self.model.shape.bounding_radius + self.model.tool.bounding_radius + 0.01
         touch, end = self.pushes.touch - self.tool_offset, self.pushes.end - self.tool_offset
         if self.contact is not None:
-            ahead = self.pushes.end[0] - self.pushes.touch[0]
+            ahead = self._contact_push()
             touch = np.concatenate([self.contact.position[None] - self.tool_offset, touch])
             end = np.concatenate([touch[:1] + ahead, end])
         way = around(self.start, touch, self.pose[:2], radius, n_via - 1)
         late_touch = np.concatenate([way, touch[:, None], end[:, None]], axis=1)
-        even = _resampled(np.concatenate([np.broadcast_to(self.start, (len(touch), 1, 2)), late_touch], axis=1), n_via + 1)
+        even = _resampled(
+            np.concatenate([np.broadcast_to(self.start, (len(touch), 1, 2)), late_touch], axis=1), n_via + 1
+        )
         both = np.stack([late_touch, even], axis=1).reshape(-1, n_via + 1, 2)
         return both if self._fixed_end is None else both[:, :n_via]
 
+    def _contact_push(self) -> NDArray:
+        """Displacement of the tool from the contact plan's touch: its direction, the length of the best known push."""
+        best = self.pushes.end[0] - self.pushes.touch[0]
+        speed = float(np.hypot(*self.contact.velocity))
+        return best if speed < 1e-6 else np.hypot(*best) * self.contact.velocity / speed
+
     def prior(self, n_via: int) -> GaussianPrior:
         """Smoothness prior times the contact plan's Gaussian on the last via-point (product of experts, 4.3.1)."""
-        duration = max(float(np.linalg.norm(self.pushes.touch[0] - self.start)) / float(self.limits.velocity.min()), 0.5)
+        push = float(np.linalg.norm(self.pushes.end[0] - self.pushes.touch[0])) / float(
+            self.limits.velocity.min()
+        )
+        approach = float(np.linalg.norm(self.pushes.touch[0] - self.start)) / float(
+            self.limits.velocity.min()
+        )
+        if self.contact is not None:
+            approach = self.contact.stamp - self.start_time
+        duration = max(approach + push, 0.3)
         prior = smoothness_prior(
-            OptimalBasis.uniform(n_via), self.start, self.velocity, self._fixed_end, np.zeros(2), duration, spread=0.06
+            OptimalBasis.uniform(n_via),
+            self.start,
+            self.velocity,
+            self._fixed_end,
+            np.zeros(2),
+            duration,
+            spread=0.06,
         )
         if self.contact is None or self._fixed_end is not None:
             return prior
@@ -233,7 +317,9 @@ class PushingProblem:
 
     def _rollouts(self, path: NDArray) -> NDArray:
         """Object poses (models, B, K, 3): the nominal model in the middle, a slippery and a sticky one around it."""
-        signs = np.array([-1.0, 0.0, 1.0] if max(self.costs.pressure_spread, self.costs.friction_spread) > 0.0 else [0.0])
+        signs = np.array(
+            [-1.0, 0.0, 1.0] if max(self.costs.pressure_spread, self.costs.friction_spread) > 0.0 else [0.0]
+        )
         per_candidate = np.repeat(signs, len(path))
         poses = rollout(
             self.model, self.pose, np.tile(path, (len(signs), 1, 1)),

@@ -19,14 +19,18 @@ CAREFULLY = 0.25
 
 def free_spots(workspace: Workspace, model: PushingModel, pose: NDArray) -> NDArray:
     """Tool positions on a coarse grid that are inside the workspace and clear of the object, shape (K, 2) [m]."""
-    x, y = np.meshgrid(np.arange(0.1, workspace.radius_max, 0.03), np.arange(-workspace.side, workspace.side + 0.01, 0.03))
+    x, y = np.meshgrid(
+        np.arange(0.1, workspace.radius_max, 0.03), np.arange(-workspace.side, workspace.side + 0.01, 0.03)
+    )
     spots = np.column_stack([x.ravel(), y.ravel()])
     inside = workspace.tool_excess(spots[:, None]) <= 0.0
     clear = np.hypot(*(spots - pose[:2]).T) > model.shape.bounding_radius + model.tool.bounding_radius + 0.02
     return spots[inside & clear]
 
 
-def enter_plane(path: TablePath, model: PushingModel, workspace: Workspace, position: NDArray, pose: NDArray, start: float) -> Trajectory:
+def enter_plane(
+    path: TablePath, model: PushingModel, workspace: Workspace, position: NDArray, pose: NDArray, start: float
+) -> Trajectory:
     """Over the table to a free spot near the tool, then straight down into the plane, resting in between.
 
     Args:
@@ -55,7 +59,9 @@ def enter_plane(path: TablePath, model: PushingModel, workspace: Workspace, posi
 
 def _move(start: NDArray, end: NDArray, limits: Limits, start_time: float) -> Trajectory:
     rest = np.zeros_like(start)
-    trajectory = synthesize(OptimalBasis.uniform(0), np.stack([start, end]), rest, rest, limits, start_time=start_time)
+    trajectory = synthesize(
+        OptimalBasis.uniform(0), np.stack([start, end]), rest, rest, limits, start_time=start_time
+    )
     broken = trajectory.violations(limits)
     if broken:
         raise InfeasibleError("the arm cannot move into its plane from here: " + "; ".join(broken))
@@ -64,7 +70,12 @@ def _move(start: NDArray, end: NDArray, limits: Limits, start_time: float) -> Tr
 
 def _check_clearance(motion: Trajectory, path: TablePath, model: PushingModel, pose: NDArray) -> None:
     tips = forward_kinematics_batch(motion(np.linspace(motion.start_time, motion.end_time, 200)))
-    near = np.hypot(*(tips[:, :2] - pose[:2]).T) < model.shape.bounding_radius + model.tool.bounding_radius + 0.02
+    near = (
+        np.hypot(*(tips[:, :2] - pose[:2]).T)
+        < model.shape.bounding_radius + model.tool.bounding_radius + 0.02
+    )
     height = tips[:, 2] - path.table_map.height
     if (height < -path.height_tolerance).any() or (near & (height < 0.6 * RAISED)).any():
-        raise InfeasibleError("on its way into the plane the tool would touch the table or the object; raise the arm by hand first")
+        raise InfeasibleError(
+            "on its way into the plane the tool would touch the table or the object; raise the arm by hand first"
+        )

@@ -17,7 +17,9 @@ STRETCHES = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
 
 def resting(position: NDArray, start: float, end: float) -> Trajectory:
     """A trajectory that stays at one position from `start` to `end` [s]."""
-    return Trajectory.from_points(np.array([start, end]), np.stack([position] * 2), np.zeros((2, len(position))))
+    return Trajectory.from_points(
+        np.array([start, end]), np.stack([position] * 2), np.zeros((2, len(position)))
+    )
 
 
 def extended(trajectory: Trajectory, end: float) -> Trajectory:
@@ -79,7 +81,9 @@ class TablePath:
         heights = forward_kinematics_batch(trajectory(times))[:, 2]
         worst = float(np.abs(heights - self.table_map.height).max())
         if worst > self.height_tolerance:
-            raise InfeasibleError(f"the tool would leave its plane by {1e3 * worst:.1f} mm (allowed {1e3 * self.height_tolerance:.1f})")
+            raise InfeasibleError(
+                f"the tool would leave its plane by {1e3 * worst:.1f} mm (allowed {1e3 * self.height_tolerance:.1f})"
+            )
 
 
 def synthesize_near(
