@@ -167,6 +167,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output left, as `| head` does; nothing can be printed any more, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        # An output folder that cannot be written to, a full disk.
+        print(f"vpsto: error: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("\nstopped", file=sys.stderr)
         return 130
