@@ -83,8 +83,8 @@ class LimitMonitor:
     def violations(self) -> int:
         """Instants beyond a limit of position, velocity, acceleration or torque, summed over kinds.
 
-        Torque-rate cuts do not count: the controller ramps the torque, which is then within its limits, whenever the
-        reference's acceleration steps; see :attr:`ramped`.
+        Torque-rate cuts do not count: the controller ramps the torque, which is then within its limits,
+        whenever the reference's acceleration steps; see :attr:`ramped`.
         """
         return int(self._counts[: KINDS.index("torque_rate")].sum())
 

@@ -96,14 +96,13 @@ class Simulation:
     def _bind(self) -> None:
         """Views into MuJoCo's state, taken once: they stay valid as long as the data lives."""
         d = self.data
-        self._q, self._qd, self._qdd = d.qpos[:7], d.qvel[:7], d.qacc[:7]
+        self._q, self._qd = d.qpos[:7], d.qvel[:7]
         self._object_q, self._object_qd = d.qpos[7:14], d.qvel[7:13]
         self._ctrl = d.ctrl
         self._body = self.model.body("object").id
         self._wrench = d.xfrc_applied[self._body]
         self._object_com = d.xipos[self._body]
         self._tip = d.site_xpos[self.model.site("tool_tip").id]
-        self._marker = self.model.body("goal").mocapid[0]
 
     @property
     def time(self) -> float:
@@ -149,11 +148,6 @@ class Simulation:
     def joint_velocity(self) -> NDArray[np.float64]:
         """Measured joint velocities [rad/s], shape (7,)."""
         return self._qd.copy()
-
-    @property
-    def joint_acceleration(self) -> NDArray[np.float64]:
-        """Joint accelerations of the last step [rad/s²], shape (7,)."""
-        return self._qdd.copy()
 
     @property
     def joint_torque(self) -> NDArray[np.float64]:
@@ -223,15 +217,6 @@ class Simulation:
                 self.time, _positive(duration, "duration"), origin, _vector(displacement, "displacement", 2)
             )
         )
-
-    def show_goal(self, pose: ArrayLike | None) -> None:
-        """Place the see-through goal marker at (x, y, yaw) [m, rad] on the table, or hide it with None."""
-        if pose is None:
-            self.data.mocap_pos[self._marker] = (0.5, 0.0, -0.5)
-            return
-        x, y, yaw = _vector(pose, "pose", 3)
-        self.data.mocap_pos[self._marker] = (x, y, 0.0)
-        self.data.mocap_quat[self._marker] = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
 
     def reset(self, object_pose: ArrayLike | None = None, joints: ArrayLike | None = None) -> None:
         """Put object and arm back, at rest, holding.

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes, wrapped
-from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes
+from vpsto_ros.estimation.object_state import ObjectState, wrap_angle
 from vpsto_ros.estimation.planar_kalman import Outcome, PlanarKalman, PlanarKalmanConfig
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
@@ -53,7 +53,7 @@ def follow(velocity, *, duration, seed=0, rate=50, dropout=0.05, latency=0.04):
             ahead = later.pose - pose[k + int(1000 * latency)]
             rows.append((stamp, state.pose - pose[k], ahead, state.twist - twist[k]))
     times, error, ahead, speed = (np.array(column) for column in zip(*rows, strict=True))
-    error[:, 2], ahead[:, 2] = wrapped(error[:, 2]), wrapped(ahead[:, 2])
+    error[:, 2], ahead[:, 2] = wrap_angle(error[:, 2]), wrap_angle(ahead[:, 2])
     return Run(times, error, ahead, speed, outcomes)
 
 
@@ -192,11 +192,11 @@ def test_one_mode_is_statistically_consistent():
             measured = truth[:3] + STD * rng.standard_normal(3)
             predicted = belief.mixed(modes, 0.02).propagated(modes, 0.02)
             innovation = predicted.innovation(measured, NOISE)
-            innovations.append(innovation.normalized(predicted.probability))
+            innovations.append(innovation.distance[0])
             belief = predicted.updated(innovation, NOISE)
         mean, covariance = belief.moments()
         error = mean - truth
-        error[2] = wrapped(error[2])
+        error[2] = wrap_angle(error[2])
         errors.append(error @ np.linalg.solve(covariance, error))
     for values, freedom in ((innovations, 3), (errors, 6)):
         low, high = chi2.ppf([0.0005, 0.9995], freedom * len(values)) / len(values)
@@ -221,13 +221,16 @@ def test_the_covariance_tells_the_truth_about_an_object_that_changes_its_mode():
     for _ in range(25):
         kalman = PlanarKalman(config)
         for k, truth in enumerate(switching_motion(config, rng, 200, 0.02)):
-            assert kalman.update(0.02 * k, truth[:3] + STD * rng.standard_normal(3), NOISE) == "accepted"
+            measured, expected = truth[:3] + STD * rng.standard_normal(3), kalman.predict(0.02 * k)
+            assert kalman.update(0.02 * k, measured, NOISE) == "accepted"
             if k < 10:
                 continue
-            innovations.append(kalman.normalized_innovation)
+            surprise = measured - expected.pose
+            surprise[2] = wrap_angle(surprise[2])
+            innovations.append(surprise @ np.linalg.solve(expected.covariance[:3, :3] + NOISE, surprise))
             state = kalman.state
             error = np.concatenate([state.pose, state.twist]) - truth
-            error[2] = wrapped(error[2])
+            error[2] = wrap_angle(error[2])
             errors.append(error @ np.linalg.solve(state.covariance, error))
     assert np.mean(innovations) == pytest.approx(3.0, abs=0.2)
     assert np.mean(errors) == pytest.approx(6.0, abs=1.0)
@@ -248,13 +251,13 @@ def test_yaw_goes_round_without_a_jump():
     kalman, rng, yaws = PlanarKalman(), np.random.default_rng(0), []
     errors = []
     for k in range(600):
-        true = wrapped(1.5 * 0.02 * k)
-        measured = np.array([0.0, 0.0, wrapped(true + STD[2] * rng.standard_normal())])
+        true = wrap_angle(1.5 * 0.02 * k)
+        measured = np.array([0.0, 0.0, wrap_angle(true + STD[2] * rng.standard_normal())])
         assert kalman.update(0.02 * k, measured, NOISE) == "accepted"
         state = kalman.predict(0.02 * k + 0.04)
         yaws.append(state.pose[2])
         assert -math.pi <= state.pose[2] <= math.pi
-        errors.append(wrapped(state.pose[2] - true - 0.06))
+        errors.append(wrap_angle(state.pose[2] - true - 0.06))
     assert rms(errors[20:]) < math.radians(1.5) and np.abs(errors).max() < 0.2
     assert max(yaws) > 3.0 and min(yaws) < -3.0
     # The same pose given with any number of full turns is the same pose.
@@ -292,7 +295,7 @@ def test_bad_poses_are_refused_with_the_reason(name):
 
 def test_a_fresh_filter_refuses_bad_poses_too():
     kalman = PlanarKalman()
-    assert kalman.state is None and kalman.predict(1.0) is None and kalman.mode_probabilities is None
+    assert kalman.state is None and kalman.predict(1.0) is None
     assert kalman.update(0.0, [math.nan] * 3, NOISE).kind == "invalid"
     assert kalman.state is None
     assert kalman.update(0.0, [0.1, 0.2, 0.3], NOISE) == "accepted"
@@ -378,11 +381,11 @@ def test_reset_forgets_everything():
 
 def test_modes_tell_what_the_object_does():
     kalman, _ = settled(poses=100)
-    assert kalman.mode_probabilities.sum() == pytest.approx(1.0)
-    assert kalman.mode_probabilities[0] > 0.6
+    assert kalman._belief.probability.sum() == pytest.approx(1.0)
+    assert kalman._belief.probability[0] > 0.6
     for k in range(100, 160):
         kalman.update(0.02 * k, np.array([0.5 + 0.3 * 0.02 * (k - 100), 0.1, 0.3]), NOISE)
-    assert kalman.mode_probabilities[0] < 0.05
+    assert kalman._belief.probability[0] < 0.05
 
 
 def test_one_mode_alone_is_a_plain_kalman_filter():
@@ -423,3 +426,16 @@ def test_an_object_state_is_checked():
 def test_outcomes_compare_as_text():
     assert Outcome("accepted") == "accepted" and Outcome("outlier", "far").reason == "far"
     assert Outcome("invalid", "why") == "invalid: why" and Outcome("invalid", "why").kind == "invalid"
+
+
+def test_angles_are_wrapped_into_one_turn_and_kept_if_they_are_in_it():
+    inside = np.concatenate([np.linspace(-3.14, np.pi, 101), [1e-300, -1e-300, 0.0]])
+    np.testing.assert_array_equal(wrap_angle(inside), inside)
+    assert wrap_angle(-np.pi) == wrap_angle(np.pi) == np.pi
+    angles = np.random.default_rng(0).uniform(-50.0, 50.0, 1000)
+    angles = np.concatenate(
+        [angles, np.nextafter([-np.pi, np.pi], 0.0), np.nextafter([-np.pi, np.pi], [-9, 9])]
+    )
+    wrapped = wrap_angle(angles)
+    assert np.all((wrapped > -np.pi) & (wrapped <= np.pi))
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-13)

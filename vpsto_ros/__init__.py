@@ -1,3 +1,3 @@
-"""Real-time planning of contact: optimal trajectories, stochastic search over via-points, contact models and filters."""
+"""Real-time planning of contact: optimal trajectories, search over via-points, contact models, filters."""
 
 __version__ = "0.1.0"

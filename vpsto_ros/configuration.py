@@ -1,7 +1,8 @@
 """Configuration as frozen dataclasses whose fields know their meaning, unit and range.
 
-A field is declared with :func:`option`; :func:`validate`, called from ``__post_init__``, refuses what is out of range. The ROS
-nodes declare their parameters from the same fields, so that a description and a range are written down once.
+A field is declared with :func:`option`; :func:`validate`, called from ``__post_init__``, refuses what is out
+of range. The ROS nodes declare their parameters from the same fields, so that a description and a range are
+written down once.
 """
 
 import dataclasses
@@ -23,14 +24,21 @@ def option(
     """A dataclass field that carries its description, unit and allowed values.
 
     Args:
-        default: default value; its type is the type that is accepted (int, float, bool, str or a tuple of one of them).
+        default: default value; its type is the type that is accepted (int, float, bool, str or a tuple of one
+            of them).
         description: one line that says what the option does.
         unit: physical unit, empty if there is none.
         minimum: smallest allowed number (also for every entry of a tuple), inclusive.
         maximum: largest allowed number, inclusive.
         choices: allowed strings.
     """
-    metadata = {"description": description, "unit": unit, "minimum": minimum, "maximum": maximum, "choices": choices}
+    metadata = {
+        "description": description,
+        "unit": unit,
+        "minimum": minimum,
+        "maximum": maximum,
+        "choices": choices,
+    }
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -62,12 +70,16 @@ def validate(config: Any) -> None:
 
 def _validate_field(owner: str, field: dataclasses.Field, value: Any) -> None:
     if not _type_fits(field.default, value) or not _value_fits(field.metadata, value):
-        raise ConfigurationError(f"{owner}.{field.name} = {value!r} is not allowed; expected {allowed(field)}")
+        raise ConfigurationError(
+            f"{owner}.{field.name} = {value!r} is not allowed; expected {allowed(field)}"
+        )
 
 
 def _type_fits(default: Any, value: Any) -> bool:
     if isinstance(default, tuple):
-        return isinstance(value, tuple) and len(value) == len(default) and all(map(_type_fits, default, value))
+        if not isinstance(value, tuple) or len(value) != len(default):
+            return False
+        return all(map(_type_fits, default, value))
     if isinstance(default, bool):
         return isinstance(value, bool)
     if isinstance(default, float):

@@ -9,9 +9,10 @@ in differences.
 import dataclasses
 import functools
 import math
-from typing import Any
 
 import numpy as np
+
+from vpsto_ros.estimation.object_state import wrap_angle
 
 _LOWEST_PROBABILITY = 1e-6
 _IDENTITY = np.eye(6)
@@ -114,7 +115,7 @@ class ModeBelief:
     def innovation(self, pose: np.ndarray, covariance: np.ndarray) -> "Innovation":
         """How a measured pose (3,) with covariance (3, 3) differs from what each mode expects."""
         difference = pose - self.mean[:, :3]
-        difference[:, 2] = wrapped(difference[:, 2])
+        difference[:, 2] = wrap_angle(difference[:, 2])
         expected = self.covariance[:, :3, :3] + covariance
         inverse = np.linalg.inv(expected)
         weighted = (inverse @ difference[:, :, None])[:, :, 0]
@@ -157,16 +158,6 @@ class Innovation:
     expected: np.ndarray
     inverse: np.ndarray
     distance: np.ndarray
-
-    def normalized(self, probability: np.ndarray) -> float:
-        """Squared Mahalanobis distance under the mixture's mean and covariance."""
-        mean, covariance = _moments(probability, self.difference, self.expected)
-        return float(mean @ np.linalg.solve(covariance, mean))
-
-
-def wrapped(angle: Any) -> Any:
-    """Angles [rad], a number or an array, brought into [-pi, pi)."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def _moments(

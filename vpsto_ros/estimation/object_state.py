@@ -1,10 +1,19 @@
 """The state of a planar object as the planners see it."""
 
 import dataclasses
+import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vpsto_ros.exceptions import InvalidInputError
+
+
+def wrap_angle(angle: NDArray | float) -> NDArray | float:
+    """The same angles in (-pi, pi] [rad], a number or an array; those already there are not changed."""
+    turns = np.ceil((np.asarray(angle) - math.pi) / (2.0 * math.pi))
+    # Rounding counts a turn for the number next to -pi, which would end up beyond pi.
+    return np.minimum(angle - 2.0 * math.pi * turns, math.pi)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from vpsto_ros.configuration import option, validate
-from vpsto_ros.estimation.motion_modes import Innovation, ModeBelief, MotionModes, wrapped
-from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes
+from vpsto_ros.estimation.object_state import ObjectState, wrap_angle
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 _FARTHEST = 1e3  # no object on a table is farther away [m]
@@ -124,26 +124,11 @@ class PlanarKalman:
         self._belief: ModeBelief | None = None
         self._stamp = -math.inf
         self._pending: list[_Measurement] = []
-        self._surprise: tuple[Innovation, np.ndarray] | None = None
 
     @property
     def state(self) -> ObjectState | None:
         """Estimate at the stamp of the last accepted pose, None before the first."""
         return None if self._belief is None else _object_state(self._stamp, self._belief)
-
-    @property
-    def mode_probabilities(self) -> np.ndarray | None:
-        """Probability of rest, steady motion and acceleration, shape (3,), None before the first pose."""
-        return None if self._belief is None else self._belief.probability
-
-    @property
-    def normalized_innovation(self) -> float:
-        """Squared Mahalanobis distance of the last pose that was compared to its prediction, NaN before.
-
-        Averages to 3 when noise and modes are as configured; much more means that the camera's covariance is
-        too small.
-        """
-        return math.nan if self._surprise is None else self._surprise[0].normalized(self._surprise[1])
 
     def predict(self, stamp: float) -> ObjectState | None:
         """State at `stamp` [s], None before the first pose.
@@ -197,7 +182,6 @@ class PlanarKalman:
     def _correct(self, belief: ModeBelief, measurement: _Measurement, gap: float) -> Outcome:
         predicted = belief.mixed(self._modes, gap).propagated(self._modes, gap)
         innovation = predicted.innovation(measurement.pose, measurement.covariance)
-        self._surprise = innovation, predicted.probability
         distance = float(innovation.distance.min())
         if not distance <= self.config.gate:
             reason = f"squared Mahalanobis distance {distance:.3g} > {self.config.gate:g}"
@@ -226,7 +210,7 @@ class PlanarKalman:
         noise = first.covariance + second.covariance
         reach = self.config.max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
         turn = self.config.max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
-        return math.hypot(step[0], step[1]) <= reach and abs(wrapped(step[2])) <= turn
+        return math.hypot(step[0], step[1]) <= reach and abs(wrap_angle(step[2])) <= turn
 
     def _restart(self, measurements: list[_Measurement]) -> None:
         """Begin at the first measurement and replay the others, so that the twist is known as well."""
@@ -263,7 +247,7 @@ def _motion_modes(config: PlanarKalmanConfig) -> MotionModes:
 
 def _object_state(stamp: float, belief: ModeBelief) -> ObjectState:
     mean, covariance = belief.moments()
-    mean[2] = wrapped(mean[2])
+    mean[2] = wrap_angle(mean[2])
     return ObjectState(stamp, mean[:3], mean[3:], covariance)
 
 
@@ -280,7 +264,7 @@ def _checked(stamp: float, pose: np.ndarray, covariance: np.ndarray) -> tuple[st
         return "stamp, pose or covariance is not finite", None
     if np.abs(where[:2]).max() > _FARTHEST:
         return f"position {where[:2]} is beyond {_FARTHEST:g} m", None
-    where[2] = wrapped(where[2])
+    where[2] = wrap_angle(where[2])
     if np.abs(noise - noise.T).max() > 1e-6 * np.abs(noise).max():
         return "covariance is not symmetric", None
     try:

@@ -5,12 +5,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from vpsto_ros.estimation.object_state import wrap_angle
 from vpsto_ros.exceptions import InvalidInputError
-
-
-def wrap_angle(angle: NDArray | float) -> NDArray | float:
-    """The same angle in (-pi, pi] [rad]."""
-    return -((-np.asarray(angle) + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -120,27 +119,6 @@ class GaussianPrior:
         total = self.precision + precision
         mean = self.mean + _solve(total, information - precision @ self.mean)
         return GaussianPrior(mean, total, self.dof)
-
-    def conditioned_on_points(self, indices: Sequence[int], points: np.ndarray) -> "GaussianPrior":
-        """The Gaussian over the other points, given the exact values of some.
-
-        Args:
-            indices: which points are given, each in 0..P-1.
-            points: their values, shape (len(indices), n).
-        """
-        given = np.zeros(self.n_points, dtype=bool)
-        given[list(indices)] = True
-        values = np.asarray(points, dtype=float)
-        if values.shape != (np.count_nonzero(given), self.dof):
-            raise InvalidInputError(
-                f"expected points ({np.count_nonzero(given)}, {self.dof}), got {values.shape}"
-            )
-        deviation = np.zeros_like(self.mean_points)
-        deviation[list(indices)] = values - self.mean_points[list(indices)]
-        known = np.repeat(given, self.dof)
-        precision = self.precision[np.ix_(~known, ~known)]
-        pull = self.precision[np.ix_(~known, known)] @ deviation.ravel()[known]
-        return GaussianPrior(self.mean[~known] - _solve(precision, pull), precision, self.dof)
 
 
 def smoothness_prior(

@@ -224,10 +224,6 @@ class Robot:
         """Inertia matrix M(q) (n, n) [kg m²] at q (n,) [rad]."""
         return self._pin.crba(self._model, self._data, self._vector(q, "q")).copy()
 
-    def gravity(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Torques g(q) [Nm], shape (n,), that hold the arm still at q (n,) [rad]."""
-        return self._pin.computeGeneralizedGravity(self._model, self._data, self._vector(q, "q")).copy()
-
     def _vector(self, values: ArrayLike, name: str) -> NDArray[np.float64]:
         vector = np.asarray(values, dtype=float)
         if vector.shape != (self.dof,):
