@@ -23,7 +23,7 @@ class ImpedanceConfig:
     """
 
     stiffness: tuple[float, ...] = option(
-        (2000.0, 2000.0, 2000.0, 2000.0, 1000.0, 800.0, 25.0),
+        (2000.0, 2000.0, 2000.0, 2000.0, 600.0, 450.0, 25.0),
         "joint stiffness", unit="Nm/rad", minimum=0.0, maximum=5000.0,
     )  # fmt: skip
     damping_ratio: float = option(1.0, "damping relative to critical", minimum=0.0, maximum=1.5)

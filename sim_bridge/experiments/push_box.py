@@ -48,6 +48,7 @@ VARIANTS = (
     Variant(
         "three_models", "averaged over three contact models", dataclasses.replace(CONFIG, costs=THREE_MODELS)
     ),
+    Variant("no_contact_plan", "without the contact planner", CONFIG, contact_planner=False),
     Variant(
         "no_warm_start",
         "without warm start",

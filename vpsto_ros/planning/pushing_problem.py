@@ -96,7 +96,7 @@ class Workspace:
         (0.40, 0.64), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0
     )
     margin: float = option(
-        0.02,
+        0.035,
         "distance from the border that plans keep for objects that need not come nearer",
         unit="m",
         minimum=0.0,
