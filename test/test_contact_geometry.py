@@ -25,6 +25,7 @@ SHAPES = {
 
 
 def inside(shape, points):
+    """Whether points are in a primitive; those on its edge are, however they are rounded."""
     result = np.zeros(len(points), dtype=bool)
     for cx, cy, hx, hy, angle, radius in shape.as_array():
         d = points - (cx, cy)
@@ -35,7 +36,10 @@ def inside(shape, points):
             ],
             1,
         )
-        result |= np.hypot(*d.T) <= radius if radius > 0 else np.all(np.abs(local) <= (hx, hy), axis=1)
+        if radius > 0:
+            result |= np.hypot(*d.T) <= radius
+        else:
+            result |= np.all(np.abs(local) <= np.array([hx, hy]) + 1e-15, axis=1)
     return result
 
 
