@@ -29,7 +29,7 @@ def random_trial(seed: int) -> Trial:
     """Start and goal anywhere, turned by anything; at least 5 cm or 30 degrees apart; 60 s, no knock."""
     rng = np.random.default_rng([seed, 1])
     shape = PlanarShape.tee()
-    plant = random_plant(shape, np.full(2, 0.04), rng)
+    plant = random_plant(shape, np.array([0.06, 0.08]), rng)
     start, goal = _poses(rng)
     while np.hypot(*(goal - start)[:2]) < 0.05 and abs(wrap_angle(goal[2] - start[2])) < np.radians(30.0):
         start, goal = _poses(rng)
