@@ -210,7 +210,7 @@ class PlanarKalman:
         noise = first.covariance + second.covariance
         reach = self.config.max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
         turn = self.config.max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
-        return math.hypot(step[0], step[1]) <= reach and abs(wrap_angle(step[2])) <= turn
+        return math.hypot(step[0], step[1]) <= reach and abs(float(wrap_angle(step[2]))) <= turn
 
     def _restart(self, measurements: list[_Measurement]) -> None:
         """Begin at the first measurement and replay the others, so that the twist is known as well."""
