@@ -1,6 +1,7 @@
-"""The pushing planner against a plant made of the contact model itself, with other parameters than the planner's."""
+"""The pushing planner against a plant made of the contact model itself, with other parameters."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ GOAL = PlanarGoal(np.array([0.50, 0.10]))
 
 
 class ModelPlant:
-    """An arm that follows its reference exactly and an object with other friction and pressure than the planner assumes."""
+    """An arm that follows its reference exactly, an object with other friction and pressure than assumed."""
 
     def __init__(self, planner: PushingMpc, tool: np.ndarray, pose: np.ndarray, seed: int = 0) -> None:
         self.planner, self.pose, self.now = planner, pose, 0.0
@@ -69,11 +70,11 @@ def run(plant: ModelPlant, goal: PlanarGoal, steps: int) -> ModelPlant:
 
 
 def assert_safe(planner: PushingMpc, published: list[Trajectory]) -> None:
-    """Joint limits and tool height at every instant; position and velocity never jump from one trajectory to the next."""
+    """Joint limits and tool height at every instant; no jump from one trajectory to the next."""
     for trajectory in published:
         planner.table_path.check(trajectory)
         assert np.abs(trajectory(trajectory.end_time, 1)).max() < 1e-9
-    for old, new in zip(published, published[1:], strict=False):
+    for old, new in itertools.pairwise(published):
         begin = max(new.start_time, old.start_time)
         q_old, v_old, _ = old.state(begin)
         q_new, v_new, _ = new.state(begin)
@@ -295,7 +296,8 @@ def test_the_contact_plan_says_where_and_which_way_to_push_first():
     for _ in range(5):
         plant.advance(GOAL)
     touch = np.array([0.53, -0.13])
-    plans = [ContactPlan(plant.now + 0.4, touch, velocity, 1e-4 * np.eye(2)) for velocity in np.array([[0.0, 0.3], [0.3, 0.0]])]
+    velocities = np.array([[0.0, 0.3], [0.3, 0.0]])
+    plans = [ContactPlan(plant.now + 0.4, touch, velocity, 1e-4 * np.eye(2)) for velocity in velocities]
     guesses = [planner._problem(plant.now, plant.pose, GOAL, plan).guesses(3)[0] for plan in plans]
     for guess, direction in zip(guesses, np.array([[0.0, 1.0], [1.0, 0.0]]), strict=True):
         np.testing.assert_allclose(guess[2], touch, atol=1e-9)

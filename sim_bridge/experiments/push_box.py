@@ -1,7 +1,9 @@
 """Pushing boxes of unknown mass, friction and centre of mass to a goal, closed loop (4.5.2).
 
-Every run draws a box, a start, a goal and one knock by hand. The planner knows the outline of the box and what a camera says; it has a
-contact model with uniform pressure and one friction value. The same runs are repeated with the thesis's end point, without warm start and
+Every run draws a box, a start, a goal and one knock by hand. The planner knows the outline of the box and
+what a camera says; it has a
+contact model with uniform pressure and one friction value. The same runs are repeated with the thesis's end
+point, without warm start and
 with a scripted straight push.
 """
 

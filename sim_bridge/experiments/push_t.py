@@ -1,6 +1,7 @@
 """Pushing a T of two 4 x 12 cm bars to a goal pose, position and orientation, closed loop.
 
-Half turns and long shifts among the runs: pushing sequences come out of replanning, there is no value function. The T's mass, friction and
+Half turns and long shifts among the runs: pushing sequences come out of replanning, there is no value
+function. The T's mass, friction and
 centre of mass vary and are unknown to the planner.
 """
 
@@ -41,6 +42,7 @@ def _poses(rng: np.random.Generator) -> np.ndarray:
 
 
 THREE_MODELS = dataclasses.replace(CONFIG.costs, pressure_spread=0.25, friction_spread=0.6)
+NO_WARM_START = dataclasses.replace(CONFIG.online, warm_start=False)
 
 VARIANTS = (
     Variant("vpsto", "VP-STO, three starts", CONFIG),
@@ -48,8 +50,10 @@ VARIANTS = (
         "one_start", "one start of the same budget",
         dataclasses.replace(CONFIG, online=OnlineConfig(search=VpstoConfig(population=72, iterations=5))),
     ),
-    Variant("three_models", "averaged over three contact models", dataclasses.replace(CONFIG, costs=THREE_MODELS)),
-    Variant("no_warm_start", "without warm start", dataclasses.replace(CONFIG, online=dataclasses.replace(CONFIG.online, warm_start=False))),
+    Variant(
+        "three_models", "averaged over three contact models", dataclasses.replace(CONFIG, costs=THREE_MODELS)
+    ),
+    Variant("no_warm_start", "without warm start", dataclasses.replace(CONFIG, online=NO_WARM_START)),
 )  # fmt: skip
 
 EXPERIMENT = PushingExperiment(

@@ -1,4 +1,4 @@
-"""An experiment on pushing: variants of the planner on the same random trials, a table, figures and summary.json."""
+"""An experiment on pushing: variants of the planner on the same trials, a table, figures, summary.json."""
 
 import argparse
 import dataclasses
@@ -58,12 +58,15 @@ class Targets:
         """What a summary falls short of, in words."""
         median = summary["time_to_goal_s_median"]
         checks = {
-            f"success rate {summary['success_rate']:.2f}, asked {self.success_rate}": summary["success_rate"] >= self.success_rate,
-            f"median time to goal {median} s, asked {self.median_time_to_goal} s": (median or np.inf) <= self.median_time_to_goal,
+            f"success rate {summary['success_rate']:.2f}, asked {self.success_rate}":
+                summary["success_rate"] >= self.success_rate,
+            f"median time to goal {median} s, asked {self.median_time_to_goal} s":
+                (median or np.inf) <= self.median_time_to_goal,
             f"p99 of replanning {summary['compute_ms']['p99']:.1f} ms, asked {1e3 * self.replan_p99:.0f} ms":
                 summary["compute_ms"]["p99"] <= 1e3 * self.replan_p99,
             f"{summary['limit_violations']} limit violations": summary["limit_violations"] == 0,
-            f"the object left the workspace in {summary['left_workspace']} runs": summary["left_workspace"] == 0,
+            f"the object left the workspace in {summary['left_workspace']} runs":
+                summary["left_workspace"] == 0,
             f"planned tool height off by {1e3 * summary['planned_height_error_m_max']:.1f} mm, asked 5 mm":
                 summary["planned_height_error_m_max"] <= 0.005,
         }  # fmt: skip
@@ -98,7 +101,7 @@ class PushingExperiment:
         )
 
     def run(self, arguments: argparse.Namespace) -> int:
-        """Run all variants on the same trials and write the results; 0 when the first one reaches its targets."""
+        """Run all variants on the same trials, write the results; 0 when the first reaches its targets."""
         folder = pathlib.Path(arguments.out)
         folder.mkdir(parents=True, exist_ok=True)
         trials = [self.random_trial(seed) for seed in range(arguments.seed, arguments.seed + arguments.runs)]

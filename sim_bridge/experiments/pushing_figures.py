@@ -10,7 +10,7 @@ from sim_bridge.experiments.pushing_trials import Trial, TrialResult
 def write(
     folder: pathlib.Path, titles: dict[str, str], trials: list[Trial], results: dict[str, list[TrialResult]]
 ) -> None:
-    """Write times.png (how many runs are done by when) and paths.png (what happened on the table) into a folder."""
+    """Write times.png (how many runs are done by when) and paths.png (what happened on the table)."""
     import matplotlib
 
     matplotlib.use("Agg")

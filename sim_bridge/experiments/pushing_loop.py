@@ -1,6 +1,9 @@
-"""The closed loop of the pushing demos in lock-step: simulated cell, camera, filter, contact planner and MPC, without ROS.
+"""The closed loop of the pushing demos in lock-step and without ROS.
 
-The planner sees what it would see on a robot: joint positions, late and noisy camera frames, the object's outline. A plan computed at time t
+Simulated cell, camera, filter, contact planner and MPC take turns.
+
+The planner sees what it would see on a robot: joint positions, late and noisy camera frames, the object's
+outline. A plan computed at time t
 reaches the arm `transport` seconds later, as a message would.
 """
 
@@ -36,7 +39,7 @@ class Recording:
 
 
 def command_from(trajectory: Trajectory, joint_names: tuple[str, ...]) -> TrajectoryCommand:
-    """The message that carries a trajectory: knots with velocities and no accelerations, which a controller joins by cubics.
+    """The message that carries a trajectory: knots with velocities, which a controller joins by cubics.
 
     Every segment of a planned trajectory is a cubic, so that the controller reproduces it.
     """
@@ -89,7 +92,7 @@ class PushingLoop:
     def _run_until(self, end: float, step: MpcStep | None) -> None:
         if step is not None and step.trajectory is not None:
             self.simulation.advance(self.transport)
-            self._deliver(step)
+            self._deliver(step, step.trajectory)
         self.simulation.advance(max(end - self.simulation.time, 0.0))
         for frame in self.simulation.camera_frames():
             self.filter.update(frame.stamp, frame.pose, frame.covariance)
@@ -106,19 +109,18 @@ class PushingLoop:
         self._next_plan = now + self.period
         return step
 
-    def _deliver(self, step: MpcStep) -> None:
-        self._check_height(step)
+    def _deliver(self, step: MpcStep, trajectory: Trajectory) -> None:
+        self._check_height(trajectory)
         try:
             self.simulation.follower.accept(
-                command_from(step.trajectory, self.planner.robot.joint_names), self.simulation.time
+                command_from(trajectory, self.planner.robot.joint_names), self.simulation.time
             )
             self.planner.accept(step)
         except TrajectoryRejected as reason:
             self.recording.rejected.append(str(reason))
 
-    def _check_height(self, step: MpcStep) -> None:
+    def _check_height(self, trajectory: Trajectory) -> None:
         """Largest deviation of the tool from its plane along what is published."""
-        trajectory = step.trajectory
         times = np.linspace(trajectory.start_time, trajectory.end_time, 200)
         heights = forward_kinematics_batch(trajectory(times))[:, 2]
         error = float(np.abs(heights - self.planner.table_map.height).max())

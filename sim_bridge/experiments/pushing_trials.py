@@ -54,8 +54,8 @@ class Trial:
     def reached(self, pose: NDArray) -> bool:
         """Whether an object pose counts as at the goal."""
         near = np.hypot(*(pose[:2] - self.goal[:2])) <= self.position_tolerance
-        turned = self.yaw_tolerance is None or abs(wrap_angle(pose[2] - self.goal[2])) <= self.yaw_tolerance
-        return bool(near and turned)
+        turned = abs(float(wrap_angle(pose[2] - self.goal[2])))
+        return bool(near and (self.yaw_tolerance is None or turned <= self.yaw_tolerance))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ class TrialResult:
 
 
 def random_plant(shape: PlanarShape, offset_scale: NDArray, rng: np.random.Generator) -> ObjectPlant:
-    """Mass 0.2-1 kg, table friction 0.2-0.6, tool friction 0.1-0.5, centre of mass off by up to 20 % of `offset_scale` (2,)."""
+    """Mass 0.2-1 kg, table friction 0.2-0.6, tool friction 0.1-0.5, mass off centre by 20 % of a scale."""
     return ObjectPlant(
         shape=shape,
         mass=float(rng.uniform(0.2, 1.0)),
@@ -117,13 +117,14 @@ def simulate(trial: Trial, joints: NDArray) -> Simulation:
 def run_trial(trial: Trial, loop: PushingLoop, workspace: Workspace) -> TrialResult:
     """Run the closed loop until the goal is held after the knock, or until the time is up."""
     sim, dwell = loop.simulation, 0.0
-    begin = 0.0 if trial.knock is None else None
-    reached_at = before_knock = None
+    begin: float | None = 0.0 if trial.knock is None else None
+    reached_at: float | None = None
+    before_knock: float | None = None
     inside = True
     while sim.time < trial.time_limit and dwell < 1.0 - 1e-9:
         if trial.knock is not None and begin is None and sim.time >= trial.knock_time:
             before_knock = reached_at
-            begin = _knock(loop, trial, workspace)
+            begin = _knock(loop, trial.knock, workspace)
             reached_at, dwell = None, 0.0
         loop.advance(CHECK)
         pose = np.asarray(sim.object_pose())
@@ -134,24 +135,27 @@ def run_trial(trial: Trial, loop: PushingLoop, workspace: Workspace) -> TrialRes
         else:
             reached_at, dwell = None, 0.0
     success = dwell >= 1.0 - 1e-9
+    held_since = reached_at - begin if success and reached_at is not None and begin is not None else None
     pose = np.asarray(sim.object_pose())
     record = loop.recording
     return TrialResult(
-        seed=trial.seed, success=success, time_to_goal=reached_at - begin if success else None,
+        seed=trial.seed, success=success, time_to_goal=held_since,
         time_to_goal_before_knock=before_knock,
-        final_error=float(np.hypot(*(pose[:2] - trial.goal[:2]))), final_yaw_error=abs(float(wrap_angle(pose[2] - trial.goal[2]))),
+        final_error=float(np.hypot(*(pose[:2] - trial.goal[:2]))),
+        final_yaw_error=abs(float(wrap_angle(pose[2] - trial.goal[2]))),
         limit_violations=sim.limits.violations, left_workspace=not inside,
         planned_height_error=record.planned_height_error, tool_height_error=sim.tool_height_deviation,
-        rejected=len(record.rejected), compute=tuple(record.compute), modes=tuple(record.mode), times=np.array(record.time),
+        rejected=len(record.rejected), compute=tuple(record.compute), modes=tuple(record.mode),
+        times=np.array(record.time),
         object_path=np.array(record.object_pose), tool_path=np.array(record.tool),
     )  # fmt: skip
 
 
-def _knock(loop: PushingLoop, trial: Trial, workspace: Workspace) -> float:
-    """Let a hand move the object, away from the border of the workspace; returns the time at which the hand lets go."""
+def _knock(loop: PushingLoop, knock: NDArray, workspace: Workspace) -> float:
+    """Let a hand move the object, away from the border; returns the time at which the hand lets go."""
     sim = loop.simulation
-    center, length = np.asarray(sim.object_pose())[:2], np.hypot(*trial.knock)
-    bearing = np.arctan2(trial.knock[1], trial.knock[0])
+    center, length = np.asarray(sim.object_pose())[:2], np.hypot(*knock)
+    bearing = np.arctan2(knock[1], knock[0])
     # The first direction, from the drawn one on, that ends well inside.
     for turn in np.arange(0.0, 2.0 * np.pi, 0.1):
         knock = length * np.array([np.cos(bearing + turn), np.sin(bearing + turn)])

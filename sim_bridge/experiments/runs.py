@@ -34,7 +34,7 @@ def success_interval(successes: int, runs: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def quantile(values: Iterable[float], q: float) -> float | None:
+def quantile(values: Iterable[float | None], q: float) -> float | None:
     """A quantile of the finite values, None if there are none."""
     finite = [value for value in values if value is not None and np.isfinite(value)]
     return float(np.quantile(finite, q)) if finite else None

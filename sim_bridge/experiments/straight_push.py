@@ -1,4 +1,4 @@
-"""The baseline that a patient engineer would script: go behind the box, push it straight at the goal, again and again."""
+"""The baseline that a patient engineer would script: go behind the box, push straight at the goal, again."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ class StraightPushScript(PushingMpc):
     ) -> MpcStep:  # fmt: skip
         problem = self._problem(now, pose, goal, None)
         plane = problem.trajectory(self._points(problem))
-        return self._joint_step(now, problem, OnlineResult(plane, "script", 0.0))
+        return self._joint_step(now, problem, OnlineResult(plane, "script", 0.0), plane)
 
     def _points(self, problem: PushingProblem) -> NDArray:
         center, tool = problem.pose[:2], problem.start + problem.tool_offset

@@ -34,7 +34,7 @@ class PushingModel:
 
     shape: PlanarShape
     tool: PlanarShape
-    pressure_radius: float | None = None
+    pressure_radius: float = None  # type: ignore[assignment]  # filled in from the shape
     friction: float = 0.3
     center_of_friction: tuple[float, float] = (0.0, 0.0)
 

@@ -1,7 +1,9 @@
 """The contact planner for pushing: where to touch the object next, as a Gaussian over tool positions.
 
-The thesis lets every trajectory end at the box centre, so that all candidates make contact, and leaves the point of contact to the search
-(4.5.2). Telling the search where touching pays makes that unnecessary: the distribution found here seeds its candidates and enters its
+The thesis lets every trajectory end at the box centre, so that all candidates make contact, and leaves the
+point of contact to the search
+(4.5.2). Telling the search where touching pays makes that unnecessary: the distribution found here seeds its
+candidates and enters its
 prior as a Gaussian over one via-point.
 """
 

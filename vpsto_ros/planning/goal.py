@@ -46,6 +46,6 @@ class PlanarGoal:
         return np.sqrt(squared)
 
     def distance(self, pose: NDArray) -> tuple[float, float]:
-        """Distance [m] and angle [rad] of one pose (3,) from the goal; the angle is 0 without a goal orientation."""
+        """Distance [m] and angle [rad] of a pose (3,) from the goal; angle 0 without a goal orientation."""
         angle = 0.0 if self.yaw is None else abs(float(wrap_angle(pose[2] - self.yaw)))
         return float(np.hypot(*(pose[:2] - self.position))), angle

@@ -1,7 +1,9 @@
 """Online VP-STO: one step of model-predictive control (4.4, Algorithm 1), for any problem.
 
-The thesis prints Algorithm 1 without its body; the steps follow the text of section 4.4. A problem says what a candidate costs, where to
-look first and how via-points become a trajectory; :class:`OnlineVpsto` decides between stopping, warm-starting and exploring.
+The thesis prints Algorithm 1 without its body; the steps follow the text of section 4.4. A problem says what
+a candidate costs, where to
+look first and how via-points become a trajectory; :class:`OnlineVpsto` decides between stopping, warm-
+starting and exploring.
 """
 
 import dataclasses
@@ -108,15 +110,17 @@ class OnlineVpsto:
 
         Args:
             problem: what to solve, from the state in which the robot will be when the plan takes over.
-            deadline: value of `clock` at which the best candidate so far is returned; None: run all iterations.
+            deadline: value of `clock` at which the best candidate so far is returned; None: run all
+                iterations.
             clock: source of that time [s].
         """
         stop = self._stop(problem)
         if stop is not None:
             return stop
-        mode = "warm_start" if self.config.warm_start and self.previous is not None else "explore"
-        result = self._search(problem, mode, deadline, clock)
-        if not result.valid:
+        previous = self.previous if self.config.warm_start else None
+        mode = "explore" if previous is None else "warm_start"
+        result = self._search(problem, previous, deadline, clock)
+        if result.points is None:
             return OnlineResult(None, mode, math.inf, result)
         return OnlineResult(problem.trajectory(result.points), mode, result.cost, result)
 
@@ -137,20 +141,24 @@ class OnlineVpsto:
         return OnlineResult(trajectory, "stop", float(evaluation.cost[0]))
 
     def _search(
-        self, problem: OnlineProblem, mode: str, deadline: float | None, clock: Callable[[], float]
+        self,
+        problem: OnlineProblem,
+        previous: Trajectory | None,
+        deadline: float | None,
+        clock: Callable[[], float],
     ) -> SearchResult:
-        n_via = self._n_via(problem, mode)
+        n_via = self._n_via(problem, previous)
         guesses, sigma = problem.guesses(n_via), self.config.search.sigma
-        if mode == "warm_start":
-            guesses = np.concatenate([problem.shifted(self.previous, n_via)[None], guesses])
+        if previous is not None:
+            guesses = np.concatenate([problem.shifted(previous, n_via)[None], guesses])
             sigma = self.config.warm_sigma
         return search(
             problem.prior(n_via), problem.evaluate, self.config.search, self.rng,
             means=guesses, sigma=sigma, deadline=deadline, clock=clock,
         )  # fmt: skip
 
-    def _n_via(self, problem: OnlineProblem, mode: str) -> int:
-        if mode == "explore" or self.config.via_rate == 0.0:
+    def _n_via(self, problem: OnlineProblem, previous: Trajectory | None) -> int:
+        if previous is None or self.config.via_rate == 0.0:
             return self.config.n_via
-        remaining = max(self.previous.end_time - problem.start_time, 0.0)
+        remaining = max(previous.end_time - problem.start_time, 0.0)
         return max(1, min(math.ceil(self.config.via_rate * remaining), self.config.n_via))

@@ -1,7 +1,9 @@
 """Straight pushes: where to touch an object, in which direction and how far, ranked by simulated outcome.
 
-A straight push is the simplest plan that makes contact. Simulating a few hundred of them with the contact model tells where touching
-pays; the contact planner turns that into a Gaussian, the pushing planner into first guesses ("go round, touch, push").
+A straight push is the simplest plan that makes contact. Simulating a few hundred of them with the contact
+model tells where touching
+pays; the contact planner turns that into a Gaussian, the pushing planner into first guesses ("go round,
+touch, push").
 """
 
 import dataclasses
@@ -85,7 +87,7 @@ def around(start: NDArray, touch: NDArray, center: NDArray, radius: float, count
     """
     a, b = start - center, touch - center
     rho_a, rho_b = np.hypot(*a), np.hypot(b[:, 0], b[:, 1])
-    turn = wrap_angle(np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[1], a[0]))
+    turn = np.asarray(wrap_angle(np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[1], a[0])))
     u = np.arange(1, count + 1) / (count + 1)
     straight = start + u[None, :, None] * (touch - start)[:, None, :]
     rho = np.maximum((1 - u) * rho_a + u * rho_b[:, None], radius)
@@ -143,7 +145,8 @@ class PushRanking:
         costs = self.error_cost * errors + (travel[:, None] + lengths) / self.speed
         if goal.yaw is None:
             costs = costs + self.rotation_cost * np.abs(poses[..., 2] - pose[2])
-        # A push that gains nothing is no plan, however little the remaining error costs compared with going round the object.
+        # A push that gains nothing is no plan, however little the remaining error costs compared
+        # with going round the object.
         idle = errors > error - max(0.1 * error, 0.0005)
         costs = np.where(idle, costs + IDLE_COST, costs)
         last = costs.argmin(axis=1)

@@ -1,7 +1,9 @@
-"""Closed-loop planar pushing with an arm: online VP-STO in the table plane, joint trajectories out (4.4, 4.5.2).
+"""Closed-loop planar pushing with an arm: online VP-STO in the table plane, joint trajectories out (4.4).
 
-The search runs in the plane in which the tool moves: with the tool vertical and at a fixed height, a plane point determines the joints, so
-seven joints would only add directions in which every candidate leaves the plane. The joint trajectory is synthesised from the plane
+The search runs in the plane in which the tool moves: with the tool vertical and at a fixed height, a plane
+point determines the joints, so
+seven joints would only add directions in which every candidate leaves the plane. The joint trajectory is
+synthesised from the plane
 solution with the same basis functions and keeps the joint limits at every instant.
 """
 
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.contact.pushing import PushingModel, rollout
 from vpsto_ros.estimation.object_state import ObjectState
-from vpsto_ros.exceptions import ConfigurationError, InfeasibleError
+from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, VpstoError
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
@@ -84,7 +86,7 @@ class PushingMpcConfig:
         validate(self)
         if self.resume_distance < self.hold_distance:
             raise ConfigurationError(
-                f"resume_distance = {self.resume_distance} is below hold_distance = {self.hold_distance}; it must not be smaller"
+                f"resume_distance = {self.resume_distance} is below hold_distance = {self.hold_distance}"
             )
 
 
@@ -93,9 +95,11 @@ class MpcStep:
     """Outcome of one planning step.
 
     Attributes:
-        trajectory: joint trajectory in absolute time, to replace what is being executed, or None when there is nothing to execute. It begins
+        trajectory: joint trajectory in absolute time, to replace what is being executed, or None when there
+            is nothing to execute. It begins
             with what is left of the running one until the new plan takes over and ends at rest.
-        mode: "explore", "warm_start", "stop" (no via-points), "hold" (goal reached), "brake" (no valid plan), "enter" (on
+        mode: "explore", "warm_start", "stop" (no via-points), "hold" (goal reached), "brake" (no valid plan),
+            "enter" (on
             the way into the plane), "wait" (not ready).
         valid: whether it is a plan that works, as opposed to a safe stop.
         message: what happened, in words, for people.
@@ -136,8 +140,10 @@ class PushingMpc:
         Raises:
             ConfigurationError: the workspace is beyond what the arm reaches.
 
-        Speed and acceleration are the tool's, in every place and direction. Near the far rim the joints can ask for less:
-        the joint trajectory is then slower than the plane motion (see :class:`TablePath`), and the step's message says so.
+        Speed and acceleration are the tool's, in every place and direction. Near the far rim the joints can
+        ask for less:
+        the joint trajectory is then slower than the plane motion (see :class:`TablePath`), and the step's
+        message says so.
         """
         self.config, self.model, self.robot = config, model, robot
         table_map = TableMap(robot, config.tool_height)
@@ -156,6 +162,13 @@ class PushingMpc:
         self.holding = False
         self.ready_at = -np.inf
         self.online.accept(None)
+
+    @property
+    def _running(self) -> Trajectory:
+        """The reference that is being followed, once there is one."""
+        if self.reference is None:
+            raise VpstoError("the planner has not taken over an arm yet")
+        return self.reference
 
     @property
     def table_map(self) -> TableMap:
@@ -196,7 +209,7 @@ class PushingMpc:
             return MpcStep(None, "wait", False, "on the way to where planning begins")
         self._observe_offset(now, joint_position)
         problem = self._reason_to_stop(now, object_state, goal)
-        if problem:
+        if problem or object_state is None or goal is None:
             return self._stop(now, "brake", problem)
         pose = self._object_at(now + self.config.lead, object_state)
         if self._goal_reached(pose, goal):
@@ -291,8 +304,8 @@ class PushingMpc:
         return MpcStep(motion, "enter", False, "moving the tool into its plane", ready_at=motion.end_time)
 
     def _observe_offset(self, now: float, joint_position: NDArray) -> None:
-        """Low-pass the offset of the tool from its reference; under load an impedance-controlled arm lags by millimetres."""
-        offset = self.table_map.tool(joint_position) - self.table_map.tool(self.reference(now))
+        """Low-pass the offset of the tool from its reference: under load the arm lags by millimetres."""
+        offset = self.table_map.tool(joint_position) - self.table_map.tool(self._running(now))
         self.tool_offset = self.tool_offset + 0.3 * (offset - self.tool_offset)
 
     def _reason_to_stop(self, now: float, state: ObjectState | None, goal: PlanarGoal | None) -> str:
@@ -301,15 +314,16 @@ class PushingMpc:
         if state is None:
             return "no object state yet"
         if now - state.stamp > self.config.object_timeout:
-            return f"the object's state is {now - state.stamp:.2f} s old (allowed {self.config.object_timeout:.2f} s)"
+            age, allowed = now - state.stamp, self.config.object_timeout
+            return f"the object's state is {age:.2f} s old (allowed {allowed:.2f} s)"
         if not self.config.workspace.contains_object(np.append(goal.position, 0.0)):
             return f"the goal ({goal.position[0]:.3f}, {goal.position[1]:.3f}) m is outside the workspace"
         return ""
 
     def _object_at(self, when: float, state: ObjectState) -> NDArray:
-        """Object pose at `when`: rolled out along the running reference since the estimate's time (latency compensation)."""
+        """Object pose at `when`: rolled out along the reference since the estimate's time."""
         times = np.linspace(min(state.stamp, when), when, 8)
-        path = self.table_map.tool(self.reference(times)) + self.tool_offset
+        path = self.table_map.tool(self._running(times)) + self.tool_offset
         return rollout(self.model, state.pose, path[None]).object_pose[0, -1]
 
     def _goal_reached(self, pose: NDArray, goal: PlanarGoal) -> bool:
@@ -330,9 +344,9 @@ class PushingMpc:
         problem = self._problem(now, pose, goal, contact)
         result = self.online.step(problem, deadline=deadline, clock=clock)
         if result.trajectory is None:
-            return self._stop(now, "brake", f"no valid plan ({result.search.status})")
+            return self._stop(now, "brake", "no valid plan found")
         try:
-            return self._joint_step(now, problem, result)
+            return self._joint_step(now, problem, result, result.trajectory)
         except InfeasibleError as error:
             return self._stop(now, "brake", f"plan refused: {error}")
 
@@ -340,20 +354,22 @@ class PushingMpc:
         self, now: float, pose: NDArray, goal: PlanarGoal, contact: ContactPlan | None
     ) -> PushingProblem:
         takeover = now + self.config.lead
-        position, velocity, _ = self.reference.state(takeover)
+        position, velocity, _ = self._running.state(takeover)
         tool = self.table_map.tool(position)
         tool_velocity = self.table_map.tool_velocity(position, velocity)
         pushes = self.ranking.rank(self.model, pose, goal, tool + self.tool_offset)
         return PushingProblem(
             self.model, self.config.costs, self.config.workspace, self.limits,
-            start=tool, velocity=np.clip(tool_velocity, -self.limits.velocity, self.limits.velocity), start_time=takeover,
+            start=tool, start_time=takeover,
+            velocity=np.clip(tool_velocity, -self.limits.velocity, self.limits.velocity),
             tool_offset=self.tool_offset, pose=pose, goal=goal, contact=contact,
             pushes=pushes.diverse(self.config.seeds, self.config.seed_separation),
         )  # fmt: skip
 
-    def _joint_step(self, now: float, problem: PushingProblem, result: OnlineResult) -> MpcStep:
-        plane = result.trajectory
-        position, velocity, _ = self.reference.state(problem.start_time)
+    def _joint_step(
+        self, now: float, problem: PushingProblem, result: OnlineResult, plane: Trajectory
+    ) -> MpcStep:
+        position, velocity, _ = self._running.state(problem.start_time)
         joints = self.table_path.joints(plane, position, velocity)
         keys = plane(np.linspace(plane.start_time, plane.end_time, 40))
         poses = rollout(self.model, problem.pose, (keys + self.tool_offset)[None]).object_pose[0]
@@ -370,9 +386,9 @@ class PushingMpc:
         )  # fmt: skip
 
     def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
-        """Come to rest gently: in the plane, a straight line with constant deceleration (a free end without via-points)."""
+        """Come to rest gently: straight in the plane, at constant deceleration (N = 0 with a free end)."""
         takeover = now + self.config.lead
-        position, velocity, _ = self.reference.state(takeover)
+        position, velocity, _ = self._running.state(takeover)
         if np.abs(velocity).max() < 1e-6:
             return MpcStep(
                 self._joined(now, resting(position, takeover, takeover + 0.5)), mode, valid, message
@@ -389,7 +405,7 @@ class PushingMpc:
 
     def _joined(self, now: float, joints: Trajectory) -> Trajectory:
         """The running reference until the new motion takes over, then the new motion."""
-        running = extended(self.reference, joints.start_time)
+        running = extended(self._running, joints.start_time)
         begin = max(now, running.start_time)
         if joints.start_time - begin < 1e-6:
             return joints
@@ -402,5 +418,6 @@ def _check_workspace(config: PushingMpcConfig, table_map: TableMap) -> None:
     space = config.workspace
     if space.radius_min < low or space.radius_max > high:
         raise ConfigurationError(
-            f"workspace.radius_min = {space.radius_min}, workspace.radius_max = {space.radius_max} m; the arm reaches {low:.3f} to {high:.3f} m"
+            f"workspace.radius_min = {space.radius_min}, workspace.radius_max = {space.radius_max} m; "
+            f"the arm reaches {low:.3f} to {high:.3f} m"
         )

@@ -1,4 +1,4 @@
-"""One planning step of planar pushing as a problem for VP-STO: candidate costs, priors and first guesses (4.5.2)."""
+"""One planning step of planar pushing as a problem for VP-STO: costs, priors and first guesses (4.5.2)."""
 
 import dataclasses
 
@@ -55,7 +55,7 @@ class PushingCosts:
         maximum=1.0,
     )
     regress: float = option(
-        2.0, "how much more an increase of the error on the way costs than error at the end; keeps the tool from dragging the object along",
+        2.0, "how much more an increase of the error on the way costs than error at the end",
         minimum=0.0, maximum=100.0,
     )  # fmt: skip
     pressure_spread: float = option(
@@ -110,11 +110,13 @@ class Workspace:
         validate(self)
         room = 2.0 * self.margin
         for name, (low, high) in {
-            "radius_min, radius_max": (self.radius_min, self.radius_max), "object_x": self.object_x, "object_y": self.object_y
+            "radius_min, radius_max": (self.radius_min, self.radius_max),
+            "object_x": self.object_x, "object_y": self.object_y,
         }.items():  # fmt: skip
             if high - low <= room:
                 raise ConfigurationError(
-                    f"Workspace.{name} = {low}, {high} leaves no room; the second must exceed the first by more than 2 margin = {room}"
+                    f"Workspace.{name} = {low}, {high} leaves no room; "
+                    f"the second must exceed the first by more than 2 margin = {room}"
                 )
 
     def tool_excess(self, path: NDArray) -> NDArray:
@@ -127,7 +129,7 @@ class Workspace:
         return np.maximum(np.maximum(beyond, behind).max(axis=1), 0.0)
 
     def object_excess(self, poses: NDArray, margin: float = 0.0) -> NDArray:
-        """How far object paths (..., K, 3) leave their region less a margin [m], shape (...) [m]; 0 inside."""
+        """How far object paths (..., K, 3) leave their region less a margin, shape (...) [m]; 0 inside."""
         low = np.array([self.object_x[0], self.object_y[0]]) + margin
         high = np.array([self.object_x[1], self.object_y[1]]) - margin
         beyond = np.maximum(low - poses[..., :2], poses[..., :2] - high)
@@ -160,7 +162,7 @@ class PushOutcome:
 
 
 class PushingProblem:
-    """Planning a push from a given state of tool and object; implements ``OnlineProblem`` in the plane (n = 2).
+    """Planning a push from a given state of tool and object: an ``OnlineProblem`` in the plane (n = 2).
 
     Search points are the via-points and, with a free end, the end point.
     """
@@ -191,7 +193,8 @@ class PushingProblem:
             start: tool position when the plan takes over, shape (2,) [m].
             velocity: tool velocity at that time, shape (2,) [m/s].
             start_time: that time [s].
-            tool_offset: where the tool is relative to its reference, shape (2,) [m]: under load an impedance-controlled arm lags.
+            tool_offset: where the tool is relative to its reference, shape (2,) [m]: under load an impedance-
+                controlled arm lags.
             pose: object pose predicted for that time, shape (3,).
             goal: where the object shall go.
             contact: where to touch, None if nobody says.
@@ -202,20 +205,21 @@ class PushingProblem:
         self.tool_offset, self.pose, self.goal = tool_offset, pose, goal
         self.contact, self.pushes = contact, pushes
         self.start_error = float(goal.error(pose, model.pressure_radius))
-        # An object that is near or beyond the border must be allowed to come back, and to go to a goal that is there.
+        # An object that is near or beyond the border must be allowed to come back, and to go to a
+        # goal that is there.
         ends = np.stack([pose, np.append(goal.position, 0.0)])[:, None]
         self._allowed_excess = float(workspace.object_excess(ends, workspace.margin).max()) + 1e-3
         self._fixed_end = pose[:2] - tool_offset if costs.end_point == "object" else None
 
     def evaluate(self, points: NDArray) -> Evaluation:
-        """Costs [s] and validity of candidates (B, P, 2): error, regress, T, rotation, smoothness; see :class:`PushingCosts`."""
+        """Costs [s] and validity of candidates (B, P, 2); :class:`PushingCosts` lists the terms."""
         outcome, costs = self.outcome(points), self.costs
         motion = outcome.motion
         cost = costs.error * (outcome.error + costs.regress * outcome.regress) + motion.duration
         if self.goal.yaw is None:
             cost = cost + costs.rotation * outcome.rotation
         if costs.smoothness > 0.0:
-            effort = np.mean((motion.acceleration / self.limits.acceleration) ** 2, axis=(1, 2))
+            effort = np.mean((np.asarray(motion.acceleration) / self.limits.acceleration) ** 2, axis=(1, 2))
             cost = cost + costs.smoothness * effort * motion.duration
         late = np.maximum(motion.duration - costs.horizon, 0.0)
         gain = outcome.error <= self.start_error - costs.minimum_gain
@@ -227,7 +231,8 @@ class PushingProblem:
         """Synthesise candidates and roll the object out along them."""
         keys = self._keys(points)
         motion = synthesize_batch(
-            OptimalBasis.uniform(keys.shape[1] - 2), keys, self.velocity, np.zeros(2), self.limits, self.costs.samples,
+            OptimalBasis.uniform(keys.shape[1] - 2), keys, self.velocity, np.zeros(2), self.limits,
+            self.costs.samples,
             derivatives=self.costs.smoothness > 0.0,
         )  # fmt: skip
         poses = self._rollouts(motion.position + self.tool_offset)
@@ -249,7 +254,7 @@ class PushingProblem:
         return synthesize(basis, keys, self.velocity, np.zeros(2), self.limits, start_time=self.start_time)
 
     def direct(self, previous: Trajectory | None) -> NDArray | None:
-        """Straight to where the previous solution ended (4.4.1); with the thesis's end point, to the object."""
+        """Straight to where the previous solution ended (4.4.1); to the object if that is the end point."""
         if self._fixed_end is not None:
             return np.zeros((0, 2))
         return None if previous is None else previous(previous.end_time)[None]
@@ -266,7 +271,7 @@ class PushingProblem:
         radius = self.model.shape.bounding_radius + self.model.tool.bounding_radius + 0.01
         touch, end = self.pushes.touch - self.tool_offset, self.pushes.end - self.tool_offset
         if self.contact is not None:
-            ahead = self._contact_push()
+            ahead = self._contact_push(self.contact)
             touch = np.concatenate([self.contact.position[None] - self.tool_offset, touch])
             end = np.concatenate([touch[:1] + ahead, end])
         way = around(self.start, touch, self.pose[:2], radius, n_via - 1)
@@ -277,14 +282,14 @@ class PushingProblem:
         both = np.stack([late_touch, even], axis=1).reshape(-1, n_via + 1, 2)
         return both if self._fixed_end is None else both[:, :n_via]
 
-    def _contact_push(self) -> NDArray:
-        """Displacement of the tool from the contact plan's touch: its direction, the length of the best known push."""
+    def _contact_push(self, contact: ContactPlan) -> NDArray:
+        """Tool displacement from the contact plan's touch: its direction, the length of the best push."""
         best = self.pushes.end[0] - self.pushes.touch[0]
-        speed = float(np.hypot(*self.contact.velocity))
-        return best if speed < 1e-6 else np.hypot(*best) * self.contact.velocity / speed
+        speed = float(np.hypot(*contact.velocity))
+        return best if speed < 1e-6 else np.hypot(*best) * contact.velocity / speed
 
     def prior(self, n_via: int) -> GaussianPrior:
-        """Smoothness prior times the contact plan's Gaussian on the last via-point (product of experts, 4.3.1)."""
+        """Smoothness prior (4.3.1) times the contact plan's Gaussian on the last via-point."""
         push = float(np.linalg.norm(self.pushes.end[0] - self.pushes.touch[0])) / float(
             self.limits.velocity.min()
         )
@@ -316,7 +321,7 @@ class PushingProblem:
         return np.concatenate(parts, axis=1)
 
     def _rollouts(self, path: NDArray) -> NDArray:
-        """Object poses (models, B, K, 3): the nominal model in the middle, a slippery and a sticky one around it."""
+        """Object poses (models, B, K, 3): the nominal model, or three from slippery to sticky."""
         signs = np.array(
             [-1.0, 0.0, 1.0] if max(self.costs.pressure_spread, self.costs.friction_spread) > 0.0 else [0.0]
         )
@@ -330,7 +335,7 @@ class PushingProblem:
 
 
 def _resampled(polyline: NDArray, count: int) -> NDArray:
-    """`count` points at even arc length along polylines (S, V, 2), the start excluded and the end included."""
+    """`count` points at even arc length along polylines (S, V, 2), without the start, with the end."""
     lengths = np.linalg.norm(np.diff(polyline, axis=1), axis=2)
     stations = np.concatenate([np.zeros((len(lengths), 1)), np.cumsum(lengths, axis=1)], axis=1)
     wanted = stations[:, -1:] * np.arange(1, count + 1) / count

@@ -18,7 +18,7 @@ CAREFULLY = 0.25
 
 
 def free_spots(workspace: Workspace, model: PushingModel, pose: NDArray) -> NDArray:
-    """Tool positions on a coarse grid that are inside the workspace and clear of the object, shape (K, 2) [m]."""
+    """Tool positions on a coarse grid inside the workspace and clear of the object, shape (K, 2) [m]."""
     x, y = np.meshgrid(
         np.arange(0.1, workspace.radius_max, 0.03), np.arange(-workspace.side, workspace.side + 0.01, 0.03)
     )
@@ -42,7 +42,8 @@ def enter_plane(
         start: start time [s].
 
     Raises:
-        InfeasibleError: there is no free spot, or the way there would sweep below the plane or through the object.
+        InfeasibleError: there is no free spot, or the way there would sweep below the plane or through the
+            object.
     """
     spots = free_spots(workspace, model, pose)
     if not len(spots):
@@ -77,5 +78,5 @@ def _check_clearance(motion: Trajectory, path: TablePath, model: PushingModel, p
     height = tips[:, 2] - path.table_map.height
     if (height < -path.height_tolerance).any() or (near & (height < 0.6 * RAISED)).any():
         raise InfeasibleError(
-            "on its way into the plane the tool would touch the table or the object; raise the arm by hand first"
+            "on its way into the plane the tool would touch the table or the object; raise the arm first"
         )

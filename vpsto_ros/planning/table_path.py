@@ -34,8 +34,10 @@ def extended(trajectory: Trajectory, end: float) -> Trajectory:
 class TablePath:
     """Maps plane trajectories to joint trajectories through dense key positions.
 
-    The joint trajectory is the spline of ch. 3 through the joint positions of the plane trajectory at evenly spaced times: with
-    about 40 ms between key positions its tool stays within a small fraction of a millimetre of the plane. Its limits are those of the
+    The joint trajectory is the spline of ch. 3 through the joint positions of the plane trajectory at evenly
+    spaced times: with
+    about 40 ms between key positions its tool stays within a small fraction of a millimetre of the plane. Its
+    limits are those of the
     joints, are checked exactly for the duration that is chosen.
 
     Attributes:
@@ -55,16 +57,19 @@ class TablePath:
 
         Args:
             plane: motion of the tool (x, y), ending at rest.
-            position: joint positions at its start [rad]; they may differ slightly from the plane's inverse kinematics.
+            position: joint positions at its start [rad]; they may differ slightly from the plane's inverse
+                kinematics.
             velocity: joint velocities at its start [rad/s].
 
         Raises:
-            InfeasibleError: the motion leaves the reachable plane, or the arm cannot follow it within limits and height tolerance.
+            InfeasibleError: the motion leaves the reachable plane, or the arm cannot follow it within limits
+                and height tolerance.
         """
         count = int(np.clip(np.ceil(plane.duration / self.spacing), 4, 100))
         phases = np.linspace(0.0, 1.0, count + 1)
         keys = self.table_map.joints(plane(plane.start_time + phases * plane.duration))
-        # What differs at the start (a remainder of the spline through the previous key positions) fades out along the way.
+        # What differs at the start (a remainder of the spline through the previous key positions)
+        # fades out along the way.
         keys = keys + (1.0 - phases[:, None]) ** 3 * (position - keys[0])
         trajectory = synthesize_near(
             OptimalBasis.uniform(count - 1), keys, velocity, self.robot, plane.duration, plane.start_time
@@ -82,7 +87,7 @@ class TablePath:
         worst = float(np.abs(heights - self.table_map.height).max())
         if worst > self.height_tolerance:
             raise InfeasibleError(
-                f"the tool would leave its plane by {1e3 * worst:.1f} mm (allowed {1e3 * self.height_tolerance:.1f})"
+                f"the tool would leave its plane by {1e3 * worst:.1f} mm"
             )
 
 
@@ -91,8 +96,10 @@ def synthesize_near(
 ) -> Trajectory:
     """The spline through joint key positions with the first feasible duration from `duration` [s] up.
 
-    The key positions are spaced for `duration`, and the arm moves already: with another one the first segment has to catch up, so that
-    durations somewhat above it are often infeasible although it is feasible itself. The rule of 3.2.1, above which *every* duration is
+    The key positions are spaced for `duration`, and the arm moves already: with another one the first segment
+    has to catch up, so that
+    durations somewhat above it are often infeasible although it is feasible itself. The rule of 3.2.1, above
+    which *every* duration is
     feasible, would then pick one several times as long; it is the last resort here.
     """
     rest = np.zeros_like(velocity)
