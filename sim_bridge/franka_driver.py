@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.executors import Executor
+from rclpy.lifecycle import TransitionCallbackReturn
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
@@ -32,7 +34,7 @@ from sim_bridge import driver_messages as messages
 from sim_bridge.camera import CameraConfig
 from sim_bridge.impedance import ImpedanceConfig
 from sim_bridge.pacing import Pacer, Ticker
-from sim_bridge.scene import TIMESTEP, Scene
+from sim_bridge.scene import Scene
 from sim_bridge.simulation import Simulation
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryCommand, TrajectoryRejected
 from vpsto_ros.configuration import option, validate
@@ -43,7 +45,7 @@ from vpsto_ros.nodes.conversions import (
     require_finite,
     require_frame,
 )
-from vpsto_ros.nodes.diagnostics import ERROR, OK, WARN, Diagnostics, Report
+from vpsto_ros.nodes.diagnostics import ERROR, OK, Diagnostics, Pulse
 from vpsto_ros.nodes.joint_conversions import read_trajectory
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
 from vpsto_ros.nodes.scene import ShapeConfig
@@ -77,7 +79,8 @@ class FrankaDriverConfig(NodeConfig):
     scene: Scene = dataclasses.field(default_factory=Scene)
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     impedance: ImpedanceConfig = dataclasses.field(default_factory=ImpedanceConfig)
-    follower: FollowerConfig = dataclasses.field(default_factory=FollowerConfig)
+    # A planner never plans that far ahead; whoever does has another clock, and would keep the arm to himself.
+    follower: FollowerConfig = dataclasses.field(default_factory=lambda: FollowerConfig(horizon=1.0))
 
     def __post_init__(self) -> None:
         validate(self)
@@ -95,6 +98,14 @@ class FrankaDriver(ManagedNode):
     """Steps the simulation in real time and speaks for it."""
 
     default_config = FrankaDriverConfig()
+    standstill = "the simulation has not been advanced"
+
+    def __init__(self, name: str, **arguments: Any) -> None:
+        """See :class:`ManagedNode`."""
+        # Between a slice of the physics and a transition: what one uses, the other destroys.
+        self._stepping = threading.RLock()
+        self._transition_waits = threading.Event()
+        super().__init__(name, **arguments)
 
     def configure(self, config: FrankaDriverConfig) -> None:
         """Build the simulation, warm it up, open the topics."""
@@ -104,8 +115,9 @@ class FrankaDriver(ManagedNode):
         self.pacer = Pacer(config.real_time_factor)
         self.paused = False
         self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future]] = queue.SimpleQueue()
-        self._last_stamp = -math.inf
-        self._accepted = self._slices = 0
+        self._earliest = -math.inf
+        self._accepted = 0
+        self._advanced = Pulse()
         self._hand: tuple[float, NDArray] | None = None
         self._measured = (time.perf_counter(), 0.0)
         self._open_topics()
@@ -165,21 +177,44 @@ class FrankaDriver(ManagedNode):
             if not running:
                 self.pacer.start(self.simulation.time)
                 running = True
+            if self._transition_waits.is_set():
+                time.sleep(0.001)  # a lock alone would let this thread have it again and again
+                continue
             self.advance()
 
     def advance(self) -> None:
         """One slice: requests, physics, messages, and a wait until its time has come."""
-        self._serve_requests()
-        if self.paused:
-            self._clock_publisher.publish(Clock(clock=self.stamp()))
-            time.sleep(0.02)
-            self.pacer.start(self.simulation.time)
-            return
-        self._disturb()
-        self.simulation.advance(SLICE)
-        self._slices += 1
-        self._publish()
-        self.pacer.wait(self.simulation.time)
+        with self._stepping:
+            if not (self.active and self.configured):
+                return
+            self._advanced.beat()
+            self._serve_requests()
+            if self.paused:
+                self._clock_publisher.publish(Clock(clock=self.stamp()))
+                self.pacer.start(self.simulation.time)
+                pause, due = 0.02, None
+            else:
+                self._disturb()
+                self.simulation.advance(SLICE)
+                self._publish()
+                pause, due = 0.0, self.simulation.time
+        if due is None:
+            time.sleep(pause)
+        else:
+            self.pacer.wait(due)
+
+    def _transition(self, *arguments: Any) -> TransitionCallbackReturn:
+        """A transition happens between two slices, never within one."""
+        self._transition_waits.set()
+        try:
+            with self._stepping:
+                return super()._transition(*arguments)
+        finally:
+            self._transition_waits.clear()
+
+    def silence(self) -> float:
+        """How long ago the simulation was advanced, or was found paused [s of wall time]."""
+        return self._advanced.silence
 
     def _serve_requests(self) -> None:
         while True:
@@ -253,14 +288,15 @@ class FrankaDriver(ManagedNode):
     def _accept(self, command: TrajectoryCommand) -> None:
         now = self.simulation.time
         start = command.stamp or now
-        if start < self._last_stamp - 1e-6:
+        if start < self._earliest - 1e-6:
             raise TrajectoryRejected(
                 "order",
-                f"its stamp {start:.3f} s is before that of the running trajectory, {self._last_stamp:.3f} "
-                "s; it came late, or from a second planner",
+                f"its stamp {start:.3f} s is before the last trajectory began or was taken, at "
+                f"{self._earliest:.3f} s; it came late, or from a second planner",
             )
         self.simulation.follower.accept(command, now)
-        self._last_stamp = start
+        # One that begins in the future must not shut out what is sent before it begins.
+        self._earliest = min(start, now)
         self._accepted += 1
 
     def _complain(self, result: Future) -> None:
@@ -283,41 +319,44 @@ class FrankaDriver(ManagedNode):
         self._hand = (self.simulation.time + self.config.disturbance_hold, wrench)
 
     def _reset_requested(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._ask(self._reset).result(timeout=5.0)
-        response.success, response.message = True, "object and arm are back where they started; time goes on"
+        return self._answer(self._reset, response, "object and arm are back where they started; time goes on")
+
+    def _answer(self, action: Callable[[], Any], response: Any, message: str) -> Any:
+        """Let the main thread act, and say so."""
+        try:
+            self._ask(action).result(timeout=5.0)
+            response.success, response.message = True, message
+        except FutureTimeout:
+            response.success, response.message = False, "the simulation does not run; nothing happened"
         return response
 
     def _reset(self) -> None:
         self.simulation.reset()
         self._hand = None
-        self._last_stamp = -math.inf
+        self._earliest = -math.inf
 
     def _pause_requested(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._ask(lambda: setattr(self, "paused", request.data)).result(timeout=5.0)
-        response.success, response.message = True, "paused" if request.data else "running"
-        return response
+        message = "paused" if request.data else "running"
+        return self._answer(lambda: setattr(self, "paused", request.data), response, message)
 
-    def report(self) -> Report:
-        """The present diagnostics."""
+    def figures(self) -> dict[str, Any]:
+        """How time passes, what was accepted, and how the limits were kept."""
         self._check_publishers()
-        sim = self.simulation
-        values: dict[str, Any] = {
+        return {
             "real_time_factor": f"{self._real_time_factor():.3f}",
-            "steps_lost": self._slices * round(SLICE / TIMESTEP) - sim.steps,
+            "behind_s": f"{self.pacer.behind(self.simulation.time):.3f}",
             "delayed_s": f"{self.pacer.delayed:.3f}",
             "trajectories_accepted": self._accepted,
-            **messages.figures(sim),
+            **messages.figures(self.simulation),
         }
-        values |= self.complaints.values()
-        if not self.active:
-            return Report(OK, "inactive", values)
-        violations = messages.limit_violations(sim)
+
+    def health(self) -> tuple[int, str]:
+        """Whether limits were kept, and nothing was refused lately."""
+        violations = self.simulation.limits.violations
         if violations:
-            return Report(ERROR, f"limits were broken at {violations} instants", values)
-        trouble = self.complaints.recent()
-        if trouble:
-            return Report(WARN, trouble, values)
-        return Report(OK, "paused" if self.paused else "running", values)
+            return ERROR, f"limits were broken at {violations} instants"
+        level, message = super().health()
+        return (level, message) if level != OK else (OK, "paused" if self.paused else "running")
 
     def _real_time_factor(self) -> float:
         """Simulated per real time since the last report."""

@@ -36,6 +36,10 @@ class Pacer:
         """Begin, or go on after a pause: simulated time [s] is now."""
         self._simulated, self._wall = simulated, self._clock()
 
+    def behind(self, simulated: float) -> float:
+        """How much later than due simulated time [s] is reached, 0 if it is early [s of wall time]."""
+        return max(self._clock() - self._wall - (simulated - self._simulated) / self.factor, 0.0)
+
     def wait(self, simulated: float) -> None:
         """Return when simulated time [s] is due; at once if that has passed."""
         due = self._wall + (simulated - self._simulated) / self.factor

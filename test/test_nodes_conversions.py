@@ -2,7 +2,6 @@
 
 import math
 import re
-import time
 
 import numpy as np
 import pytest
@@ -301,16 +300,9 @@ def test_contact_plans_round_trip_and_broken_ones_are_refused():
         read_contact(empty, TimeBase(), FRAME)
 
 
-def test_building_a_message_is_fast():
+def test_a_long_trajectory_becomes_one_point_per_knot():
     sent = spline(np.random.default_rng(0), n_via=58)
-    trajectory_message(sent, NAMES)
-    took = []
-    for _ in range(30):
-        begin = time.perf_counter()
-        message = trajectory_message(sent, NAMES)
-        took.append(time.perf_counter() - begin)
-    assert len(message.points) == 60
-    print(f"60 x 7 points in {1e3 * np.median(took):.2f} ms")
+    assert len(trajectory_message(sent, NAMES).points) == 60
 
 
 def test_time_text_in_errors_is_plain():

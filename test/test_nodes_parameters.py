@@ -23,6 +23,7 @@ from std_msgs.msg import Float64
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+from vpsto_ros.nodes.diagnostics import Cycles, Pulse
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig
 from vpsto_ros.nodes.parameters import declare_parameters, read_parameters
 
@@ -232,9 +233,35 @@ def test_refused_messages_are_counted_and_bugs_surface():
     assert spin(node, bad)
     assert "in refused: -1.0 is negative" in node.complaints.recent()
     node.received = None  # what a bug looks like
-    with pytest.raises(AttributeError):
-        spin(node, lambda: helper.publish(Float64(data=1.0)))
+
+    def bug():
+        helper.publish(Float64(data=1.0))
+        return node.faults >= 3
+
+    assert spin(node, bug), "the node lives on"
+    report = node.report()
+    assert report.level == 2 and "AttributeError" in report.message
+    assert report.values["internal_errors"] == node.faults and len(node._faults_logged) == 1
     node.destroy_node()
+
+
+def test_a_pulse_is_measured_by_its_own_clock():
+    now = [0.0]
+    pulse = Pulse(lambda: now[0])
+    pulse.see(7)
+    now[0] = 3.0
+    pulse.see(7)
+    assert pulse.silence == 3.0
+    pulse.see(8)
+    assert pulse.silence == 0.0
+
+
+def test_cycles_count_what_was_skipped():
+    cycles = Cycles(0.05)
+    assert [cycles.begin(t) for t in (0.0, 0.05, 0.1, 0.175)] == [0, 0, 0, 0]  # half a period late is jitter
+    assert [cycles.begin(t) for t in (0.275, 0.475)] == [1, 3]
+    assert cycles.begin(9.0, at_work=False) == cycles.begin(9.5) == 0
+    assert (cycles.count, cycles.skipped) == (7, 4)
 
 
 def test_bugs_in_transitions_are_not_swallowed():

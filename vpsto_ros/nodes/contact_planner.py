@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -14,7 +15,7 @@ from vpsto_ros.configuration import option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import contact_message, read_state
-from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate, Report
+from vpsto_ros.nodes.diagnostics import OK, STALE, Diagnostics, Durations, Rate, Report
 from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, latched, run
 from vpsto_ros.nodes.scene import ModelConfig, goal_on_table
@@ -91,19 +92,14 @@ class ContactPlannerNode(ManagedNode):
         self._rate.tick()
         self._status = Report()
 
-    def report(self) -> Report:
-        """The present diagnostics."""
-        values = {
-            "rate_hz": f"{self._rate.take():.2f}",
-            **self._compute.milliseconds("compute"),
-            **self.complaints.values(),
-        }
-        if not self.active:
-            return Report(OK, "inactive", values)
-        trouble = self.complaints.recent()
-        if trouble and self._status.level == OK:
-            return Report(WARN, trouble, values)
-        return Report(self._status.level, self._status.message, values)
+    def figures(self) -> dict[str, Any]:
+        """Rate and compute time."""
+        return {"rate_hz": f"{self._rate.take():.2f}", **self._compute.milliseconds("compute")}
+
+    def health(self) -> tuple[int, str]:
+        """Whether it plans."""
+        status = self._status
+        return super().health() if status.level == OK else (status.level, status.message)
 
     def _missing(self, now: float) -> str:
         """What keeps the node from planning, empty if nothing does."""
@@ -125,11 +121,13 @@ class ContactPlannerNode(ManagedNode):
         self._marker_publisher.publish(MarkerArray(markers=drawn))
 
     def _receive_joints(self, message: JointState) -> None:
+        stamp = self.seconds(message.header.stamp)
         position, _ = read_joint_state(message, JOINT_NAMES)
         self.tool = forward_kinematics_batch(position[None])[0, :2]
-        self.tool_stamp = self.time_base.seconds(message.header.stamp)
+        self.tool_stamp = stamp
 
     def _receive_object(self, message: Odometry) -> None:
+        self.seconds(message.header.stamp)
         self.object = read_state(message, self.time_base, self.config.base_frame)
 
     def _receive_goal(self, message: PoseStamped) -> None:

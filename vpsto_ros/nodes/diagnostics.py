@@ -73,6 +73,61 @@ class Rate:
         return rate
 
 
+class Cycles:
+    """Counts the cycles of a periodic job, and those that it skipped because it was late."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._last: float | None = None
+        self.count = self.skipped = 0
+
+    def pause(self) -> None:
+        """The job has nothing to do for now."""
+        self._last = None
+
+    def begin(self, now: float, at_work: bool = True) -> int:
+        """Begin a cycle at `now` [s]; returns how many periods were skipped before it.
+
+        Args:
+            now: the time, by the clock of the job's timer.
+            at_work: whether the job has anything to do; otherwise nothing is counted.
+        """
+        if not at_work:
+            self.pause()
+            return 0
+        gap = self._period if self._last is None else now - self._last
+        # More than half a period late; up to that the clock's own steps and jitter are to blame.
+        skipped = max(0, math.ceil(gap / self._period - 1.5 - 1e-6))
+        self._last = now
+        self.count += 1
+        self.skipped += skipped
+        return skipped
+
+
+class Pulse:
+    """How long ago, by a steady clock, something last happened: which tells when time itself stands."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seen: Any = None
+        self.beat()
+
+    def beat(self) -> None:
+        """It happens now."""
+        self._last = self._clock()
+
+    def see(self, value: Any) -> None:
+        """It happens now if a value is another than at the last look."""
+        if value != self._seen:
+            self._seen = value
+            self.beat()
+
+    @property
+    def silence(self) -> float:
+        """Time since the last beat [s]."""
+        return self._clock() - self._last
+
+
 class Complaints:
     """Counts what went wrong by kind and logs each kind at most once per period.
 

@@ -3,11 +3,13 @@
 import dataclasses
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import rclpy
+from builtin_interfaces.msg import Time
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import JumpThreshold
@@ -22,10 +24,17 @@ from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
 from vpsto_ros.configuration import option
-from vpsto_ros.exceptions import ConfigurationError, VpstoError
+from vpsto_ros.exceptions import ConfigurationError, InvalidInputError, VpstoError
 from vpsto_ros.nodes.conversions import TimeBase
-from vpsto_ros.nodes.diagnostics import Complaints
+from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Complaints, Pulse, Report
 from vpsto_ros.nodes.parameters import check_change, declare_parameters, read_parameters
+
+MAX_AHEAD = 0.5
+"""A message stamped farther in the future is refused: it would look fresh long after its sender died [s]."""
+MAX_SILENCE = 1.0
+"""A node whose time stands still for longer, by a steady clock, reports STALE [s]."""
+FAULT_SHOWN = 5.0
+"""An unexpected error shows as ERROR for so long after it last happened [s]."""
 
 # A best-effort publisher never reaches a reliable subscriber; the other way round works.
 EXTERNAL = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -56,15 +65,21 @@ class NodeConfig:
     base_frame: str = option("fr3_link0", "frame of all poses: the robot's base, z up, table at z = 0")
 
 
+class NoTimeYet(VpstoError):
+    """A stamp came before the first message on /clock, so that nobody can say how old it is."""
+
+
 class ManagedNode(LifecycleNode):
     """A lifecycle node that is configured once from its parameters.
 
-    Subclasses set `default_config` and fill in :meth:`configure` (and, where needed, :meth:`on_time_reset`
-    and :meth:`stop`). Publishers, subscriptions and timers made with the methods of this class are silent
-    while the node is inactive and are removed by `cleanup`.
+    Subclasses set `default_config` and fill in :meth:`configure`, :meth:`figures` and :meth:`health` (and,
+    where needed, :meth:`on_time_reset`, :meth:`stop` and `standstill`, what the diagnostics say when the time
+    does not go on). Publishers, subscriptions and timers made with the methods of this class are silent while
+    the node is inactive and are removed by `cleanup`.
     """
 
     default_config: ClassVar[Any] = NodeConfig()
+    standstill: ClassVar[str] = "time stands still (the source of /clock is paused or gone)"
 
     def __init__(self, name: str, **arguments: Any) -> None:
         """Declare the parameters.
@@ -81,6 +96,10 @@ class ManagedNode(LifecycleNode):
         self.configured = False
         self.active = False
         self.complaints = Complaints(self.get_logger().warning)
+        self.faults = 0
+        self._fault = (-FAULT_SHOWN, "")
+        self._faults_logged: set[str] = set()
+        self._pulse = Pulse()
         self.time_base = TimeBase()
         self._timers_kept: list[Timer] = []
         self._subscriptions_kept: list[Any] = []
@@ -116,7 +135,92 @@ class ManagedNode(LifecycleNode):
     def on_time_reset(self) -> None:
         """Forget everything that carries a time: the clock went backwards because a simulation restarted."""
 
+    def figures(self) -> dict[str, Any]:
+        """What the diagnostics show as values, besides what every node shows."""
+        return {}
+
+    def health(self) -> tuple[int, str]:
+        """Level and message of the diagnostics of an active node."""
+        trouble = self.complaints.recent()
+        return (WARN, trouble) if trouble else (OK, "ok")
+
+    def silence(self) -> float:
+        """How long the node's time has stood still, by a steady clock [s]."""
+        self._pulse.see(self.get_clock().now().nanoseconds)
+        return self._pulse.silence
+
     # What subclasses use.
+
+    def report(self) -> Report:
+        """The present diagnostics.
+
+        What a node says of its inputs counts in its own time. When that stands still, because whoever
+        publishes /clock died, ages freeze and everything would look fresh for ever; hence the steady clock.
+        """
+        values = {**self.figures(), **self.complaints.values(), "internal_errors": self.faults}
+        if not self.active:
+            return Report(OK, "inactive", values)
+        when, fault = self._fault
+        if time.monotonic() - when < FAULT_SHOWN:
+            return Report(ERROR, fault, values)
+        silence = self.silence()
+        if silence > MAX_SILENCE:
+            return Report(STALE, f"{self.standstill} for {silence:.1f} s", values)
+        return Report(*self.health(), values)
+
+    def seconds(self, stamp: Time, ahead: float = MAX_AHEAD) -> float:
+        """The stamp of a message that has just come, in seconds of the node's time base [s].
+
+        Args:
+            stamp: the stamp.
+            ahead: how far in the future it may lie [s].
+
+        Raises:
+            InvalidInputError: it lies farther in the future.
+            NoTimeYet: the simulation's clock was not heard yet.
+        """
+        now, then = self.now(), self.time_base.seconds(stamp)
+        if now + self.time_base.origin == 0.0:
+            raise NoTimeYet("no message on /clock yet")
+        if then > now + ahead:
+            raise InvalidInputError(
+                f"the stamp is {then - now:.2f} s in the future (allowed {ahead} s); do both sides use one "
+                "clock (use_sim_time)?"
+            )
+        return then
+
+    def guarded(self, callback: Callable[..., None], topic: str = "") -> Callable[..., None]:
+        """A callback that survives its errors: what is wrong with inputs is counted, a bug is shown as one.
+
+        Args:
+            callback: what to call.
+            topic: what it handles; empty for a timer.
+        """
+
+        def call(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except NoTimeYet:
+                return
+            except VpstoError as error:
+                text = f"{topic} refused: {error}" if topic else str(error)
+                self.complaints.add(topic or "cycle", text)
+            except Exception as error:
+                if not self.context.ok():
+                    raise  # publishing while a signal takes the context away
+                self._take_fault(error)
+
+        return call
+
+    def _take_fault(self, error: Exception) -> None:
+        """Log an unexpected error, each kind in full once, and show it in the diagnostics."""
+        lines = traceback.format_exception(error)
+        self.faults += 1
+        self._fault = (time.monotonic(), f"internal error, going on: {type(error).__name__}: {error}")
+        where = "".join(lines[:-1])
+        if where not in self._faults_logged:
+            self._faults_logged.add(where)
+            self.get_logger().error("".join(lines))
 
     def now(self) -> float:
         """The node's time in the seconds of its time base [s]; handles a clock that went backwards."""
@@ -136,14 +240,11 @@ class ManagedNode(LifecycleNode):
         self, kind: type, topic: str, callback: Callable, qos: QoSProfile = EXTERNAL
     ) -> Subscription:
         """Listen to a topic; a message that the callback refuses with a VpstoError is counted and logged."""
+        handle = self.guarded(callback, topic)
 
         def receive(message: Any) -> None:
-            if not self.active:
-                return
-            try:
-                callback(message)
-            except VpstoError as error:
-                self.complaints.add(topic, f"{topic} refused: {error}")
+            if self.active:
+                handle(message)
 
         subscription = self.create_subscription(kind, topic, receive, qos)
         self._subscriptions_kept.append(subscription)
@@ -166,7 +267,13 @@ class ManagedNode(LifecycleNode):
         Timers know nothing of the lifecycle: they are created stopped, started by `activate` and cancelled by
         `deactivate`.
         """
-        timer = self.create_timer(period, callback, callback_group=group)
+        run = self.guarded(callback)
+
+        def tick() -> None:
+            self._pulse.beat()
+            run()
+
+        timer = self.create_timer(period, tick, callback_group=group)
         timer.cancel()
         self._timers_kept.append(timer)
 
@@ -231,6 +338,7 @@ class ManagedNode(LifecycleNode):
 
     def _activate(self) -> None:
         self.active = True
+        self._pulse.beat()
         for timer in self._timers_kept:
             timer.reset()
 

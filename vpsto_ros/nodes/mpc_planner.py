@@ -1,9 +1,9 @@
 """The node that moves the arm: joint, object and contact states in, joint_trajectory out, at 20 to 50 Hz."""
 
-import dataclasses
 import math
 import threading
 import time
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -14,58 +14,25 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from vpsto_ros.configuration import option, validate
 from vpsto_ros.estimation.object_state import ObjectState
-from vpsto_ros.exceptions import VpstoError
+from vpsto_ros.exceptions import ConfigurationError, VpstoError
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import read_contact, read_state
-from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics, Durations, Rate, Report
+from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Cycles, Diagnostics, Durations, Rate
 from vpsto_ros.nodes.joint_conversions import read_joint_state, trajectory_message
-from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, latched, reliable, run
-from vpsto_ros.nodes.scene import ModelConfig, goal_on_table
-from vpsto_ros.nodes.sent_plans import JointSample, SentPlans, follows
+from vpsto_ros.nodes.lifecycle import ManagedNode, latched, reliable, run
+from vpsto_ros.nodes.mpc_planner_config import TRANSPORT, MpcPlannerConfig
+from vpsto_ros.nodes.scene import goal_on_table
+from vpsto_ros.nodes.sent_plans import AT_REST, JointSample, SentPlans, follows, runs_on, stop_from
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.pushing import MpcStep, PushingMpc, PushingMpcConfig
+from vpsto_ros.planning.pushing import MpcStep, PushingMpc
 from vpsto_ros.robot.kinematics import fr3_pusher
 
-TRANSPORT = 0.004
-"""What is left at least for the way from here to the controller [s]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class MpcPlannerConfig(NodeConfig):
-    """Parameters of the planner."""
-
-    rate: float = option(20.0, "planning rate", unit="Hz", minimum=1.0, maximum=50.0)
-    deadline: float = option(
-        0.035,
-        "a plan not ready so long after the start of its cycle is dropped",
-        unit="s",
-        minimum=0.002,
-        maximum=1.0,
-    )
-    reserve: float = option(
-        0.006,
-        "part of the deadline that is kept for what follows the search",
-        unit="s",
-        minimum=0.0,
-        maximum=0.5,
-    )
-    joint_timeout: float = option(
-        0.1, "nothing is published when joint_states are older", unit="s", minimum=0.02, maximum=10.0
-    )
-    contact_timeout: float = option(
-        0.5, "a contact_plan received longer ago is not used", unit="s", minimum=0.02, maximum=10.0
-    )
-    goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
-    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
-    seed: int = option(0, "seed of the search", minimum=0)
-    model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
-    planner: PushingMpcConfig = dataclasses.field(default_factory=PushingMpcConfig)
-
-    def __post_init__(self) -> None:
-        validate(self)
+STOP_PATIENCE = 1.0
+"""How long a node that is deactivated waits for the arm to stop [s of wall time]."""
+CONTACT_AHEAD = 10.0
+"""A contact plan says when the tool can be there; no way takes it longer [s]."""
 
 
 class MpcPlannerNode(ManagedNode):
@@ -84,19 +51,18 @@ class MpcPlannerNode(ManagedNode):
         self.config = config
         self.robot = fr3_pusher()
         self._lock = threading.Lock()  # guards the planner, which the timer, ~/stop and transitions use
-        self.planner = PushingMpc(
-            config.planner, config.model.model(), self.robot, np.random.default_rng(config.seed)
-        )
-        self.planner.warm_up()
+        self.deadline = config.deadline_in_force
+        self.planner = self._make_planner(config)
         self.goal: PlanarGoal | None = None
         self.paused = False
-        self._compute, self._rate, self._cycles = Durations(), self._node_time_rate(), 0
+        self._compute, self._rate = Durations(), self._node_time_rate()
+        self._cycles = Cycles(1.0 / config.rate)
         self.deadline_misses = 0
         self.on_time_reset()
         self._publisher = self.advertise(JointTrajectory, "joint_trajectory", reliable(1))
         self._marker_publisher = self.advertise(MarkerArray, "~/markers", latched())
         self.subscribe(JointState, "joint_states", self._receive_joints)
-        self.subscribe(JointState, "desired_joint_states", self._receive_desired)
+        self._desired_input = self.subscribe(JointState, "desired_joint_states", self._receive_desired)
         self.subscribe(Odometry, "object_state", self._receive_object)
         self.subscribe(Odometry, "contact_plan", self._receive_contact)
         self.subscribe(PoseStamped, "goal_pose", self._receive_goal)
@@ -104,6 +70,19 @@ class MpcPlannerNode(ManagedNode):
         self.every(1.0 / config.rate, self.plan, MutuallyExclusiveCallbackGroup())
         self.every(1.0 / config.marker_rate, self._publish_markers)
         self.diagnostics = Diagnostics(self, self.report)
+
+    def _make_planner(self, config: MpcPlannerConfig) -> PushingMpc:
+        rng = np.random.default_rng(config.seed)
+        planner = PushingMpc(config.planner, config.model.model(), self.robot, rng)
+        try:
+            planner.warm_up()
+        except ModuleNotFoundError as error:
+            strategy = config.planner.online.search.strategy
+            raise ConfigurationError(
+                f"planner.online.search.strategy = '{strategy}' needs the Python "
+                f"package '{error.name}'; install it, or choose a strategy of this package, such as 'sep-cma'"
+            ) from error
+        return planner
 
     def cleanup(self) -> None:
         """Stop reporting."""
@@ -113,7 +92,9 @@ class MpcPlannerNode(ManagedNode):
         """Forget what carries a time; the goal stays."""
         self.joints: JointSample | None = None
         self.desired: JointSample | None = None
+        self._reported: JointSample | None = None  # the last one of desired; that is used up
         self._sent = SentPlans()
+        self._cycles.pause()
         self.object: ObjectState | None = None
         self.contact: tuple[float, ContactPlan] | None = None
         self.last: MpcStep = MpcStep(None, "wait", False, "no joint_states yet")
@@ -122,58 +103,73 @@ class MpcPlannerNode(ManagedNode):
         self._restart = True
 
     def stop(self) -> None:
-        """Brake the arm."""
+        """Brake the arm and see to it that it stops, as far as the controller says what it does."""
         with self._lock:
-            self._brake()
+            self._brake(self.now())
+            if self._reported is not None and self._sent:
+                self._await_stop()
 
     def plan(self) -> None:
         """Plan once and publish the result if it is ready in time."""
         begin = time.perf_counter()
         with self._lock:
-            now = self.now()
-            if self._restart:
-                self._restart = False
-                self.planner.reset()
-            if self.paused or not self.active or not self._ready(now):
-                return
-            self._check_reference()
-            step = self._step(now, begin)
-            if step is None:
-                return
-            took = time.perf_counter() - begin
-            self._cycles += 1
-            if step.iterations > 0:
-                self._compute.add(took)
-            # Node time as well: a simulation that runs faster than planned for needs its plans earlier.
-            if took > self.config.deadline or self._now() > now + self.config.planner.lead - TRANSPORT:
-                self.deadline_misses += 1
-                self.complaints.add(
-                    "deadline", f"a plan was ready after {1e3 * took:.1f} ms, too late; dropped"
-                )
-                return
-            self._execute(step)
+            try:
+                self._cycle(begin)
+            except Exception as error:
+                self._brake_after(error)
+                raise  # counted, logged and shown by the caller, which goes on
 
-    def report(self) -> Report:
-        """The present diagnostics."""
-        now, step = self.now(), self.last
-        values = {
+    def _cycle(self, begin: float) -> None:
+        now = self.now()
+        if self._restart:
+            self._restart = False
+            self.planner.reset()
+        if not self.active:
+            return
+        if self.paused or not self._ready(now):
+            self._cycles.pause()
+            if self.paused:
+                self._keep_stopped(now)
+            return
+        tried = self.goal is not None and self._object_is_fresh(now)
+        self.deadline_misses += self._cycles.begin(now, tried)
+        self._check_reference()
+        step = self._step(now, begin)
+        if step is None:
+            return
+        took = time.perf_counter() - begin
+        if step.iterations > 0:
+            self._compute.add(took)
+        # Node time as well: a simulation that runs faster than planned for needs its plans earlier.
+        if took > self.deadline or self._now() > now + self.config.planner.lead - TRANSPORT:
+            self.deadline_misses += tried
+            self.complaints.add("deadline", f"a plan was ready after {1e3 * took:.1f} ms, too late; dropped")
+            return
+        self._execute(step)
+
+    def _object_is_fresh(self, now: float) -> bool:
+        return self.object is not None and now - self.object.stamp <= self.config.planner.object_timeout
+
+    def figures(self) -> dict[str, Any]:
+        """Rates, compute times, the plan and the ages of the inputs."""
+        step = self.last
+        return {
             "rate_hz": f"{self._rate.take():.2f}",
-            "cycles": self._cycles,
+            "cycles": self._cycles.count,
+            "skipped_cycles": self._cycles.skipped,
             "deadline_misses": self.deadline_misses,
+            "deadline_ms": f"{1e3 * self.deadline:.1f}",
             **self._compute.milliseconds("compute"),
             "mode": "paused" if self.paused else step.mode,
             "valid": step.valid,
             "cost": f"{step.cost:.3f}",
             "iterations": step.iterations,
-            **self._ages(now),
-            **self.complaints.values(),
+            **self._ages(self.now()),
         }
-        level, message = self._health(step)
-        return Report(level, message, values)
 
-    def _health(self, step: MpcStep) -> tuple[int, str]:
-        if not self.active:
-            return OK, "inactive"
+    def health(self) -> tuple[int, str]:
+        """Whether it plans."""
+        step = self.last
         if self.paused:
             return WARN, "stopped by ~/stop; call it with false to resume"
         if self.joints is None or step.mode == "wait":
@@ -210,7 +206,7 @@ class MpcPlannerNode(ManagedNode):
         position = joints.position + joints.velocity * max(now - joints.stamp, 0.0)
         contact = self.contact
         fresh = contact is not None and now - contact[0] <= config.contact_timeout
-        deadline = begin + max(config.deadline - config.reserve, 0.0)
+        deadline = begin + max(self.deadline - config.reserve, 0.0)
         inputs = (now, position, joints.velocity, self.object, self.goal, contact[1] if fresh else None)
         try:
             return self.planner.step(*inputs, deadline=deadline)
@@ -261,18 +257,72 @@ class MpcPlannerNode(ManagedNode):
         elif self.last.mode == "brake" and step.mode != "brake":
             self.get_logger().info(f"going on: {step.message}")
 
-    def _brake(self) -> None:
+    def _brake(self, now: float) -> None:
         """Send the quickest stop that the arm can still join when the message arrives."""
         if self.joints is None:
             return
-        trajectory = self.planner.stop(self.now() + self.config.planner.lead)
+        self._check_reference()
+        trajectory = self.planner.stop(now + self.config.planner.lead)
         if trajectory is not None:
             self._send(MpcStep(trajectory, "brake", False, "stopped"))
+
+    def _brake_after(self, error: Exception) -> None:
+        """Stop an arm whose planning failed unexpectedly; if that fails too, its last plan ends in a stop."""
+        self.last = MpcStep(None, "wait", False, f"internal error: {error}")
+        try:
+            now = self.now()
+            if self.planner.reference is not None and not self._resting(now):
+                self._brake(now)
+        except Exception as second:
+            self.complaints.add("stop", f"braking failed as well: {second}")
+
+    def _resting(self, now: float) -> bool:
+        return bool(np.abs(self.planner.reference(now + self.config.planner.lead, 1)).max() < 1e-6)
+
+    def _keep_stopped(self, now: float) -> None:
+        """Stop an arm again that moves on: the message that should have stopped it was lost or came late."""
+        config, desired, joints = self.config, self._reported, self.joints
+        told = desired is not None and abs(now - desired.stamp) <= config.joint_timeout
+        sample = desired if told else joints
+        if sample is None or abs(now - sample.stamp) > config.joint_timeout:
+            return
+        tolerance = None if told else config.planner.joint_tolerance
+        if not runs_on(self.planner.reference, sample, tolerance):
+            return
+        self.complaints.add("stop_lost", "the arm moves on although it was told to stop; braking again")
+        self.desired = desired if told else None
+        self._check_reference()
+        if told and self.planner.reference is not None:
+            self._brake(now)
+            return
+        # Nobody knows which motion that is: stop it from where it will be, later if only measured.
+        at = now + config.planner.lead * (1.0 if told else 4.0)
+        step = MpcStep(stop_from(sample, self.robot.limits, at), "brake", False, "stopped")
+        self._send(step)
+        self.planner.accept(step)
+
+    def _await_stop(self) -> None:
+        """Stop the arm again and again until the controller's reference rests.
+
+        No callback runs meanwhile: what the controller says is taken by hand, and its stamps tell the time.
+        """
+        give_up = time.monotonic() + STOP_PATIENCE
+        while time.monotonic() < give_up:
+            time.sleep(0.02)
+            with self._desired_input.handle:
+                taken = self._desired_input.handle.take_message(JointState, False)
+            if taken is None:
+                continue
+            self._receive_desired(taken[0])
+            if np.abs(self._reported.velocity).max() < AT_REST:
+                return
+            self._keep_stopped(self._reported.stamp)
+        self.complaints.add("stop", f"the arm was told to stop; {STOP_PATIENCE:g} s later it was not seen to")
 
     def _stop_requested(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         with self._lock:
             if request.data and not self.paused:
-                self._brake()
+                self._brake(self.now())
             self.paused = request.data
         response.success = True
         response.message = "stopped; call again with false to resume" if request.data else "planning"
@@ -281,16 +331,19 @@ class MpcPlannerNode(ManagedNode):
 
     def _receive_joints(self, message: JointState) -> None:
         position, velocity = read_joint_state(message, self.robot.joint_names)
-        self.joints = JointSample(self.time_base.seconds(message.header.stamp), position, velocity)
+        self.joints = JointSample(self.seconds(message.header.stamp), position, velocity)
 
     def _receive_desired(self, message: JointState) -> None:
         position, velocity = read_joint_state(message, self.robot.joint_names)
         self.desired = JointSample(self.time_base.seconds(message.header.stamp), position, velocity)
+        self._reported = self.desired
 
     def _receive_object(self, message: Odometry) -> None:
+        self.seconds(message.header.stamp)
         self.object = read_state(message, self.time_base, self.config.base_frame)
 
     def _receive_contact(self, message: Odometry) -> None:
+        self.seconds(message.header.stamp, CONTACT_AHEAD)
         plan = read_contact(message, self.time_base, self.config.base_frame)
         self.contact = (self._now(), plan)
 

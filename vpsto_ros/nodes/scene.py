@@ -99,6 +99,10 @@ class TableConfig:
 
     def __post_init__(self) -> None:
         validate(self)
+        for name in ("x", "y"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ConfigurationError(f"{name} = [{low}, {high}]: the first must be below the second")
 
     def check(self, reading: PoseReading) -> None:
         """Raise InvalidInputError for a pose that is not on the table, saying why."""

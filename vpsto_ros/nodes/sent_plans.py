@@ -6,13 +6,19 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from vpsto_ros.planning.pushing import AT_REST as MEASURED_REST
 from vpsto_ros.planning.pushing import MpcStep
-from vpsto_ros.trajectory import Trajectory
+from vpsto_ros.planning.table_path import extended
+from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory
 
 POSITION_MATCH = 1e-3
 """The controller follows a plan if its reference is nearer than this [rad]."""
 VELOCITY_MATCH = 1e-2
 """And its velocity nearer than this [rad/s]."""
+AT_REST = 1e-3
+"""A controller's reference slower than this rests [rad/s]."""
+SETTLING = 0.3
+"""So long after its reference an arm may still move [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +46,10 @@ class SentPlans:
     def __init__(self, length: int = 12) -> None:
         self._steps: collections.deque[MpcStep] = collections.deque(maxlen=length)
 
+    def __bool__(self) -> bool:
+        """Whether anything was sent."""
+        return bool(self._steps)
+
     def add(self, step: MpcStep) -> None:
         """Remember a plan that was sent."""
         self._steps.append(step)
@@ -61,3 +71,29 @@ def follows(trajectory: Trajectory, desired: JointSample) -> bool:
     return bool(
         position_error < POSITION_MATCH and np.abs(velocity - desired.velocity).max() < VELOCITY_MATCH
     )
+
+
+def runs_on(stop: Trajectory | None, sample: JointSample, tolerance: float | None) -> bool:
+    """Whether an arm moves on although it was sent a trajectory that stops it.
+
+    Args:
+        stop: that trajectory, preceded by what ran before; None if nothing is known to run.
+        sample: what the controller follows, or what was measured.
+        tolerance: how far a measured joint may be from its reference [rad]; None for a controller's word.
+    """
+    speed = np.abs(sample.velocity).max()
+    if tolerance is None:
+        if stop is not None and sample.stamp < stop.start_time:
+            return False
+        return bool(speed > AT_REST and (stop is None or not follows(stop, sample)))
+    if speed <= MEASURED_REST or (stop is not None and sample.stamp < stop.start_time):
+        return False
+    if stop is None or sample.stamp > stop.end_time + SETTLING:
+        return True
+    return bool(np.abs(stop(sample.stamp) - sample.position).max() > tolerance)
+
+
+def stop_from(sample: JointSample, limits: Limits, at: float) -> Trajectory:
+    """The quickest stop, beginning at a time [s], of an arm of whose motion only a sample is known."""
+    position = sample.position + sample.velocity * (at - sample.stamp)
+    return extended(braking_trajectory(position, sample.velocity, limits, start_time=at), at + 0.5)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
@@ -15,7 +16,7 @@ from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import belief_message, read_observation, state_message
-from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate, Report
+from vpsto_ros.nodes.diagnostics import STALE, Diagnostics, Durations, Rate
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
 from vpsto_ros.nodes.scene import TableConfig
 
@@ -74,6 +75,7 @@ class StateEstimator(ManagedNode):
             [config.position_std**2, config.position_std**2, config.yaw_std**2]
         )
         self._update_time, self._rate = Durations(), Rate()
+        self.reinitialized = 0
         self._warm_up()
         self.on_time_reset()
         self._state_publisher = self.advertise(Odometry, "object_state", reliable(1))
@@ -105,26 +107,32 @@ class StateEstimator(ManagedNode):
             return state
         return self.filter.predict(state.stamp + ahead) if ahead <= self.config.prediction else None
 
-    def report(self) -> Report:
-        """The present diagnostics."""
-        state, now = self.filter.state, self.now()
-        age = math.inf if state is None else now - state.stamp
+    def figures(self) -> dict[str, Any]:
+        """Rate, age, compute time and uncertainty of the estimate, and how often it began anew."""
+        state = self.filter.state
         values = {
             "rate_hz": f"{self._rate.take():.2f}",
-            "frame_age_s": f"{age:.3f}",
+            "frame_age_s": f"{self._age():.3f}",
+            "reinitialized": self.reinitialized,
             **self._update_time.milliseconds("compute"),
-            **self.complaints.values(),
         }
         if state is not None:
             values["position_std_mm"] = f"{1e3 * math.sqrt(np.trace(state.covariance[:2, :2]) / 2.0):.3f}"
-        if not self.active:
-            return Report(OK, "inactive", values)
-        if state is None:
-            return Report(STALE, "no camera frame yet" + self._because(), values)
+        return values
+
+    def health(self) -> tuple[int, str]:
+        """Whether frames come and are taken."""
+        age = self._age()
+        if math.isinf(age):
+            return STALE, "no camera frame yet" + self._because()
         if age > self.config.fresh + self.config.prediction:
-            return Report(STALE, f"the camera has been silent for {age:.1f} s" + self._because(), values)
-        trouble = self.complaints.recent()
-        return Report(WARN, trouble, values) if trouble else Report(values=values)
+            return STALE, f"the camera has been silent for {age:.1f} s" + self._because()
+        return super().health()
+
+    def _age(self) -> float:
+        """Age of the last frame [s], inf without one."""
+        state = self.filter.state
+        return math.inf if state is None else self.now() - state.stamp
 
     def _because(self) -> str:
         trouble = self.complaints.recent()
@@ -134,23 +142,20 @@ class StateEstimator(ManagedNode):
         with self._update_time.measured():
             reading, covariance = read_observation(message, self.config.base_frame)
             self.config.table.check(reading)
-            now, stamp = self.now(), self.time_base.seconds(message.header.stamp)
-            self._check_stamp(stamp, now)
+            now, stamp = self.now(), self.seconds(message.header.stamp, self.config.max_ahead)
+            self._check_age(stamp, now)
             self._update(stamp, reading.pose, self._default_covariance if covariance is None else covariance)
         self._last_frame = now
         self._publish(now)
 
-    def _check_stamp(self, stamp: float, now: float) -> None:
-        if stamp > now + self.config.max_ahead:
-            raise InvalidInputError(
-                f"the stamp is {stamp - now:.2f} s in the future; do both sides use one clock?"
-            )
+    def _check_age(self, stamp: float, now: float) -> None:
         if stamp < now - self.config.max_age:
             raise InvalidInputError(f"the frame is {now - stamp:.2f} s old (allowed {self.config.max_age} s)")
 
     def _update(self, stamp: float, pose: NDArray, covariance: NDArray) -> None:
         outcome = self.filter.update(stamp, pose, covariance)
         if outcome.kind == "reinitialized":
+            self.reinitialized += 1
             self.get_logger().info(f"the object is somewhere else: {outcome.reason}")
         elif outcome.kind != "accepted":
             self.complaints.add(outcome.kind, f"frame not used, {outcome.kind}: {outcome.reason}")

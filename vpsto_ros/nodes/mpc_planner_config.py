@@ -1,0 +1,73 @@
+"""Parameters of the node that moves the arm, and what they must satisfy together."""
+
+import dataclasses
+
+from vpsto_ros.configuration import option, validate
+from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.nodes.lifecycle import NodeConfig
+from vpsto_ros.nodes.scene import ModelConfig
+from vpsto_ros.planning.pushing import PushingMpcConfig
+
+TRANSPORT = 0.004
+"""What is left at least for the way from here to the controller [s]."""
+_CYCLE_SHARE, _LEAD_SHARE = 0.9, 0.7  # of the cycle and of the lead that the automatic deadline takes
+
+
+@dataclasses.dataclass(frozen=True)
+class MpcPlannerConfig(NodeConfig):
+    """Parameters of the planner."""
+
+    rate: float = option(20.0, "planning rate", unit="Hz", minimum=1.0, maximum=50.0)
+    deadline: float = option(
+        0.0,
+        "a plan not ready so long after the start of its cycle is dropped; 0 takes the smaller of 0.9 cycles "
+        "and 0.7 planner.lead",
+        unit="s",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    reserve: float = option(
+        0.006,
+        "part of the deadline that is kept for what follows the search",
+        unit="s",
+        minimum=0.0,
+        maximum=0.5,
+    )
+    joint_timeout: float = option(
+        0.1, "nothing is published when joint_states are older", unit="s", minimum=0.02, maximum=10.0
+    )
+    contact_timeout: float = option(
+        0.5, "a contact_plan received longer ago is not used", unit="s", minimum=0.02, maximum=10.0
+    )
+    goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
+    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
+    seed: int = option(0, "seed of the search", minimum=0)
+    model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+    planner: PushingMpcConfig = dataclasses.field(default_factory=PushingMpcConfig)
+
+    def __post_init__(self) -> None:
+        validate(self)
+        deadline, latest = self.deadline_in_force, self.planner.lead - TRANSPORT
+        name = f"deadline = {deadline:g} s" if self.deadline else f"deadline = 0 (here {deadline:g} s)"
+        if deadline > 1.0 / self.rate + 1e-9:
+            raise ConfigurationError(
+                f"{name} is longer than a cycle of {1.0 / self.rate:g} s (rate = {self.rate:g} Hz); lower "
+                "it, or set it to 0 for one that fits"
+            )
+        if deadline > latest + 1e-9:
+            raise ConfigurationError(
+                f"{name} is more than planner.lead = {self.planner.lead:g} s less {TRANSPORT:g} s for the "
+                "way to the controller, so every plan would come late; lower it, set it to 0 "
+                "or raise planner.lead"
+            )
+        if self.reserve >= deadline:
+            raise ConfigurationError(
+                f"reserve = {self.reserve:g} s must be below {name}: nothing would be left for the search "
+                f"(planner.lead = {self.planner.lead:g} s, rate = {self.rate:g} Hz)"
+            )
+
+    @property
+    def deadline_in_force(self) -> float:
+        """The deadline as given, or the automatic one [s]."""
+        lead = self.planner.lead
+        return self.deadline or min(_CYCLE_SHARE / self.rate, _LEAD_SHARE * lead, lead - TRANSPORT)
