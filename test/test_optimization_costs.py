@@ -1,11 +1,14 @@
 """Cost terms against fine sampling and SciPy, and VP-STO from end to end."""
 
+import doctest
+
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 from scipy.interpolate import CubicSpline
 
 from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, InvalidInputError
+from vpsto_ros.optimization import costs
 from vpsto_ros.optimization.costs import (
     CostWeights,
     JointSpaceProblem,
@@ -204,3 +207,8 @@ def test_errors_name_what_is_wrong():
         around_the_disc().evaluate(np.zeros((5, 2, 2)))
     with pytest.raises(ConfigurationError, match=r"CostWeights\.collision = -1"):
         CostWeights(collision=-1.0)
+
+
+def test_the_example_in_the_documentation_is_right():
+    outcome = doctest.testmod(costs)
+    assert outcome.attempted >= 10 and outcome.failed == 0

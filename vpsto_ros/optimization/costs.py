@@ -155,6 +155,31 @@ class CostWeights:
 class JointSpaceProblem:
     """Move from a state to a goal fast, smoothly, within joint limits and without collision (4.3).
 
+    Two degrees of freedom around a disc of radius 0.3:
+
+    >>> import numpy as np
+    >>> from vpsto_ros.optimization.costs import JointSpaceProblem
+    >>> from vpsto_ros.optimization.vpsto import VpstoConfig, search
+    >>> from vpsto_ros.trajectory import Limits, OptimalBasis
+    >>> limits = Limits(velocity=np.full(2, 1.0), acceleration=np.full(2, 2.0))
+    >>> problem = JointSpaceProblem(
+    ...     OptimalBasis.uniform(3),
+    ...     limits,
+    ...     start=np.zeros(2),
+    ...     goal=np.array([1.0, 0.0]),
+    ...     collision=lambda q: np.hypot(q[..., 0] - 0.5, q[..., 1]) < 0.32,
+    ... )
+    >>> prior, rng = problem.prior(spread=0.3), np.random.default_rng(0)
+    >>> result = search(prior, problem.evaluate, VpstoConfig(iterations=15), rng)
+    >>> result.valid
+    True
+    >>> trajectory = problem.trajectory(result.points)
+    >>> trajectory.violations(limits)
+    []
+    >>> path = trajectory(np.linspace(0.0, trajectory.duration, 500))
+    >>> bool(np.hypot(path[:, 0] - 0.5, path[:, 1]).min() > 0.3)
+    True
+
     Attributes:
         basis: optimal basis with N via-points.
         limits: velocity and acceleration limits, and position limits if there are any, of n joints.
