@@ -3,6 +3,7 @@
 import os
 import random
 import sys
+import threading
 import time
 
 import numpy as np
@@ -734,3 +735,38 @@ def test_a_stop_is_stopped_from_what_is_known():
     assert not runs_on(stop, JointSample(1.2, q + 0.1, np.zeros(7)), None)
     assert stop.violations(fr3_pusher().limits) == []
     assert np.allclose(stop(stop.end_time, 1), 0.0)
+
+
+def test_a_deactivated_planner_sees_to_it_that_the_arm_stops(planner):
+    planner.says = True
+    start_moving(planner, arm(planner, deaf=lambda: False))
+    other = rclpy.create_node("controller")
+    executor = rclpy.executors.SingleThreadedExecutor()
+    executor.add_node(other)
+    inbox, ended = [], threading.Event()
+    other.create_subscription(JointTrajectory, "joint_trajectory", inbox.append, 10)
+    desired = other.create_publisher(JointState, "desired_joint_states", 10)
+    while not (desired.get_subscription_count() and other.count_publishers("joint_trajectory")):
+        time.sleep(0.01)
+
+    def controller():
+        """Runs on while the planner's process is busy with its transition, and loses the first message."""
+        while not ended.is_set():
+            planner.time += 0.01
+            executor.spin_once(timeout_sec=0.01)
+            if len(inbox) > 1:
+                planner.running = trajectory_from_message(inbox[-1])
+            q, qd, _ = planner.running.state(planner.time)
+            desired.publish(joint_message(planner, q, velocity=qd))
+
+    thread = threading.Thread(target=controller)
+    thread.start()
+    try:
+        planner.node.trigger_deactivate()
+    finally:
+        ended.set()
+        thread.join()
+        executor.shutdown()
+        other.destroy_node()
+    assert not planner.node.active and len(inbox) >= 2
+    assert speed(planner) < 2e-3 and not planner.node.complaints.counts["stop"]
