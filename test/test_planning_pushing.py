@@ -14,8 +14,9 @@ from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.contact import ContactPlan, ContactPlannerConfig, PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.mpc import OnlineConfig
-from vpsto_ros.planning.pushing import PushingMpc, PushingMpcConfig
-from vpsto_ros.planning.pushing_problem import PushingCosts, Workspace
+from vpsto_ros.planning.pushing import PushingMpc
+from vpsto_ros.planning.pushing_config import PushingCosts, PushingMpcConfig
+from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.trajectory import Trajectory
 

@@ -15,7 +15,7 @@ from sim_bridge.experiments.pushing_trials import KNOCK_MARGIN, Trial, run_trial
 from sim_bridge.experiments.runs import markdown_table, quantile, run_trials, success_interval, write_summary
 from sim_bridge.scene import ObjectPlant
 from vpsto_ros.contact.geometry import PlanarShape
-from vpsto_ros.planning.pushing_problem import Workspace
+from vpsto_ros.planning.workspace import Workspace
 
 GOAL = np.array([0.5, 0.1, 0.0])
 AWAY = np.array([0.5, -0.1, 0.0])

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sim_bridge.experiments.runs import markdown_table, write_summary
 from vpsto_ros.exceptions import InfeasibleError
-from vpsto_ros.planning.pushing_problem import Workspace
 from vpsto_ros.planning.table_path import TablePath
+from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import forward_kinematics_batch, fr3_pusher

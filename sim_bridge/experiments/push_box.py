@@ -17,8 +17,7 @@ from sim_bridge.experiments.pushing_trials import Trial, random_knock, random_pl
 from sim_bridge.experiments.straight_push import StraightPushScript
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.planning.mpc import OnlineConfig
-from vpsto_ros.planning.pushing import PushingMpcConfig
-from vpsto_ros.planning.pushing_problem import PushingCosts
+from vpsto_ros.planning.pushing_config import PushingCosts, PushingMpcConfig
 
 CONFIG = PushingMpcConfig()
 

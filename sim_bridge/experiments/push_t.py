@@ -16,8 +16,7 @@ from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.goal import wrap_angle
 from vpsto_ros.planning.mpc import OnlineConfig
-from vpsto_ros.planning.pushing import PushingMpcConfig
-from vpsto_ros.planning.pushing_problem import PushingCosts
+from vpsto_ros.planning.pushing_config import PushingCosts, PushingMpcConfig
 
 CONFIG = PushingMpcConfig(
     seeds=6,

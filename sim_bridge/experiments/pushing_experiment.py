@@ -17,7 +17,8 @@ from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.planning.contact import ContactPlannerConfig, PushContactPlanner
-from vpsto_ros.planning.pushing import PushingMpc, PushingMpcConfig
+from vpsto_ros.planning.pushing import PushingMpc
+from vpsto_ros.planning.pushing_config import PushingMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
 
 TOOL_RADIUS = 0.015

@@ -62,5 +62,5 @@ def _path(axes, trial: Trial, run: TrialResult) -> None:
     axes.plot(*trial.goal[:2], "g+", ms=14, label="goal")
     outcome = f"{run.time_to_goal:.1f} s to the goal" if run.success else "not reached"
     axes.set_title(f"run {run.seed}: {outcome}", fontsize=9)
-    axes.set_aspect("equal")
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.grid(alpha=0.3)

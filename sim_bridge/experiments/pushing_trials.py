@@ -11,7 +11,7 @@ from sim_bridge.scene import ObjectPlant, Scene
 from sim_bridge.simulation import Simulation
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.planning.goal import PlanarGoal, wrap_angle
-from vpsto_ros.planning.pushing_problem import Workspace
+from vpsto_ros.planning.workspace import Workspace
 
 CHECK = 0.05
 """Period at which success is judged on the ground truth [s]."""

@@ -21,7 +21,7 @@ from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, latched, run
 from vpsto_ros.nodes.scene import ModelConfig, goal_on_table
 from vpsto_ros.planning.contact import ContactPlan, ContactPlannerConfig, PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.pushing_problem import Workspace
+from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.robot.kinematics import JOINT_NAMES, forward_kinematics_batch
 
 

@@ -6,7 +6,7 @@ from vpsto_ros.configuration import option, validate
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.scene import ModelConfig
-from vpsto_ros.planning.pushing import PushingMpcConfig
+from vpsto_ros.planning.pushing_config import PushingMpcConfig
 
 TRANSPORT = 0.004
 """What is left at least for the way from here to the controller [s]."""

@@ -12,7 +12,7 @@ from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.nodes.conversions import PoseReading, read_goal
 from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.pushing_problem import Workspace
+from vpsto_ros.planning.workspace import Workspace
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,15 +14,15 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
 from vpsto_ros.contact.pushing import PushingModel, rollout
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, VpstoError
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
+from vpsto_ros.planning.mpc import OnlineResult, OnlineVpsto
 from vpsto_ros.planning.pushes import PushRanking
-from vpsto_ros.planning.pushing_problem import PushingCosts, PushingProblem, Workspace
+from vpsto_ros.planning.pushing_config import PushingMpcConfig
+from vpsto_ros.planning.pushing_problem import PushingProblem
 from vpsto_ros.planning.table_entry import enter_plane
 from vpsto_ros.planning.table_path import TablePath, extended, resting
 from vpsto_ros.robot.inverse_kinematics import TableMap
@@ -31,63 +31,6 @@ from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory
 
 AT_REST = 0.02
 """Joint speed below which the arm counts as standing [rad/s]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PushingMpcConfig:
-    """Options of the pushing planner."""
-
-    lead: float = option(
-        0.05,
-        "time between the start of planning and the moment the plan takes over",
-        unit="s",
-        minimum=0.005,
-        maximum=1.0,
-    )
-    speed: float = option(0.35, "largest tool speed in x and in y", unit="m/s", minimum=0.01, maximum=2.0)
-    acceleration: float = option(
-        1.8, "largest tool acceleration in x and in y", unit="m/s^2", minimum=0.05, maximum=20.0
-    )
-    tool_height: float = option(
-        0.02, "height of the tool's tip above the table", unit="m", minimum=0.002, maximum=0.5
-    )
-    hold_distance: float = option(
-        0.002, "the goal counts as reached, and the arm rests, within", unit="m", minimum=1e-4, maximum=0.5
-    )
-    resume_distance: float = option(
-        0.004,
-        "a resting arm resumes when the object is farther off than",
-        unit="m",
-        minimum=1e-4,
-        maximum=0.5,
-    )
-    seeds: int = option(
-        3, "straight pushes from different sides offered as first guesses", minimum=1, maximum=32
-    )
-    contacts: int = option(24, "touch points tried along the outline for those", minimum=8, maximum=400)
-    seed_separation: float = option(
-        0.03, "distance between the touch points of those", unit="m", minimum=0.0, maximum=1.0
-    )
-    joint_tolerance: float = option(
-        0.06,
-        "the plan is begun anew when a joint is farther from its reference",
-        unit="rad",
-        minimum=1e-3,
-        maximum=1.0,
-    )
-    object_timeout: float = option(
-        0.5, "the arm stops when the object's state is older", unit="s", minimum=0.02, maximum=10.0
-    )
-    costs: PushingCosts = dataclasses.field(default_factory=PushingCosts)
-    workspace: Workspace = dataclasses.field(default_factory=Workspace)
-    online: OnlineConfig = dataclasses.field(default_factory=OnlineConfig)
-
-    def __post_init__(self) -> None:
-        validate(self)
-        if self.resume_distance < self.hold_distance:
-            raise ConfigurationError(
-                f"resume_distance = {self.resume_distance} is below hold_distance = {self.hold_distance}"
-            )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
 from vpsto_ros.contact.pushing import PushingModel, rollout
-from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.optimization.vpsto import Evaluation
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushes import StraightPushes, around
+from vpsto_ros.planning.pushing_config import PushingCosts
+from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.priors.contact import contact_factor
 from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
 from vpsto_ros.trajectory import (
@@ -25,119 +25,6 @@ from vpsto_ros.trajectory import (
 
 INVALID_COST = 100.0
 """Offset that ranks every invalid candidate behind the valid ones."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PushingCosts:
-    """Weights and limits of the pushing objective."""
-
-    error: float = option(
-        60.0, "seconds that one metre of remaining error is worth", unit="s/m", minimum=0.0, maximum=1e4
-    )
-    rotation: float = option(
-        0.5,
-        "seconds that one radian of rotation is worth if the goal has no orientation",
-        unit="s/rad",
-        minimum=0.0,
-        maximum=1e3,
-    )
-    smoothness: float = option(
-        0.0, "weight of the squared acceleration, per limit squared and second", minimum=0.0, maximum=1e3
-    )
-    horizon: float = option(
-        6.0, "longest trajectory that counts as valid", unit="s", minimum=0.5, maximum=60.0
-    )
-    minimum_gain: float = option(
-        0.0005,
-        "smallest reduction of the error that makes a candidate valid",
-        unit="m",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    regress: float = option(
-        2.0, "how much more an increase of the error on the way costs than error at the end",
-        minimum=0.0, maximum=100.0,
-    )  # fmt: skip
-    pressure_spread: float = option(
-        0.0,
-        "relative spread of the pressure radius in the three models over which costs are averaged",
-        minimum=0.0,
-        maximum=0.9,
-    )
-    friction_spread: float = option(
-        0.0,
-        "relative spread of the tool's friction in those models; both 0: one model",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    samples: int = option(64, "samples along a trajectory", minimum=8, maximum=1000)
-    end_point: str = option(
-        "free",
-        "where trajectories end: free, or at the object's centre as in the thesis",
-        choices=("free", "object"),
-    )
-
-    def __post_init__(self) -> None:
-        validate(self)
-
-
-@dataclasses.dataclass(frozen=True)
-class Workspace:
-    """Where the tool and the object may be, base frame [m]."""
-
-    radius_min: float = option(
-        0.305, "smallest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0
-    )
-    radius_max: float = option(
-        0.76, "largest distance of the tool from the robot's axis", unit="m", minimum=0.0, maximum=2.0
-    )
-    side: float = option(0.45, "the tool stays within +- side in y", unit="m", minimum=0.0, maximum=2.0)
-    object_x: tuple[float, float] = option(
-        (0.40, 0.64), "range of the object's origin in x", unit="m", minimum=-2.0, maximum=2.0
-    )
-    margin: float = option(
-        0.035,
-        "distance from the border that plans keep for objects that need not come nearer",
-        unit="m",
-        minimum=0.0,
-        maximum=0.2,
-    )
-    object_y: tuple[float, float] = option(
-        (-0.32, 0.32), "range of the object's origin in y", unit="m", minimum=-2.0, maximum=2.0
-    )
-
-    def __post_init__(self) -> None:
-        validate(self)
-        room = 2.0 * self.margin
-        for name, (low, high) in {
-            "radius_min, radius_max": (self.radius_min, self.radius_max),
-            "object_x": self.object_x, "object_y": self.object_y,
-        }.items():  # fmt: skip
-            if high - low <= room:
-                raise ConfigurationError(
-                    f"Workspace.{name} = {low}, {high} leaves no room; "
-                    f"the second must exceed the first by more than 2 margin = {room}"
-                )
-
-    def tool_excess(self, path: NDArray) -> NDArray:
-        """How far tool paths (B, K, 2) leave their region, shape (B,) [m]; 0 inside."""
-        radius = np.sqrt(np.einsum("bki,bki->bk", path, path))
-        beyond = np.maximum(
-            np.maximum(self.radius_min - radius, radius - self.radius_max), np.abs(path[..., 1]) - self.side
-        )
-        behind = 0.1 - path[..., 0]
-        return np.maximum(np.maximum(beyond, behind).max(axis=1), 0.0)
-
-    def object_excess(self, poses: NDArray, margin: float = 0.0) -> NDArray:
-        """How far object paths (..., K, 3) leave their region less a margin, shape (...) [m]; 0 inside."""
-        low = np.array([self.object_x[0], self.object_y[0]]) + margin
-        high = np.array([self.object_x[1], self.object_y[1]]) - margin
-        beyond = np.maximum(low - poses[..., :2], poses[..., :2] - high)
-        return np.maximum(beyond.max(axis=(-2, -1)), 0.0)
-
-    def contains_object(self, pose: NDArray) -> bool:
-        """Whether an object pose (x, y, ...) is inside the region of objects."""
-        return bool(self.object_excess(np.append(np.asarray(pose, dtype=float)[:2], 0.0)[None]) == 0.0)
 
 
 @dataclasses.dataclass(frozen=True)

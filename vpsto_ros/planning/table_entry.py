@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import InfeasibleError
-from vpsto_ros.planning.pushing_problem import Workspace
 from vpsto_ros.planning.table_path import TablePath
+from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import forward_kinematics_batch
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize
