@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -7,7 +8,14 @@ from sim_bridge.demo.scenario import Phase, Scenario
 from sim_bridge.report import recording as rec
 from sim_bridge.report.bag import BagRecorder, read_messages, typestore
 from sim_bridge.report.recording import Command, JointSeries, PoseSeries, Recording, Status
-from sim_bridge.report.summary import RunFacts, command_violations, failures, limit_violations, summarize
+from sim_bridge.report.summary import (
+    RunFacts,
+    command_violations,
+    failures,
+    limit_violations,
+    planner_figures,
+    summarize,
+)
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import fr3_pusher
 
@@ -149,6 +157,15 @@ def test_poses_are_interpolated_the_short_way_round_and_targets_are_held(bag):
     assert distance == pytest.approx([0.1])
 
 
+def driver_status(**changes):
+    kinds = ("reference_position", "joint_velocity", "torque")
+    values = {f"limit.{kind}.instants": "0" for kind in kinds} | {
+        f"limit.{kind}.worst": "0.9" for kind in kinds
+    }
+    values |= {"limit_violations": "0", "demand.torque_rate.instants": "12"}
+    return Status(10.0, 0, "ok", values | changes)
+
+
 def good_run():
     robot = fr3_pusher()
     time = np.linspace(0.0, 10.0, 1001)
@@ -163,9 +180,10 @@ def good_run():
         "compute_p99_ms": "5",
         "compute_max_ms": "9",
         "deadline_misses": "1",
+        "skipped_cycles": "0",
         "cycles": "200",
     }
-    diagnostics = {"mpc_planner": [Status(9.9, 0, "ok", values)]}
+    diagnostics = {"mpc_planner": [Status(10.0, 0, "ok", values)], "franka_driver": [driver_status()]}
     return Recording(
         JointSeries(time, joints, still, still.copy()), *[PoseSeries(time, target) for _ in range(3)],
         commands, diagnostics,
@@ -175,13 +193,14 @@ def good_run():
 def good_story():
     story = Scenario(np.random.default_rng(0))
     story.phases = [
-        Phase(phase.name, phase.timeout, i, i + 1.0, i + 0.5) for i, phase in enumerate(story.phases)
+        Phase(phase.name, phase.timeout, i, i + 1.0, i + 0.5)
+        for i, phase in zip([0.0, 2.0, 4.0, 6.0, 8.0, 9.0], story.phases, strict=True)
     ]
     story.drift_distances = [0.01, 0.02, 0.03]
     return story
 
 
-FACTS = RunFacts(seed=3, first_plan=1.5, elapsed=5.0, trouble=[], tool_height=0.02)
+FACTS = RunFacts(seed=3, first_plan=1.5, elapsed=5.0, trouble=[], tool_height=0.02, planner_rate=20.0)
 
 
 def test_a_good_run_is_a_success_with_all_promised_figures():
@@ -189,7 +208,7 @@ def test_a_good_run_is_a_success_with_all_promised_figures():
     assert summary["success"] and summary["failures"] == []
     assert summary["final_error_m"] == pytest.approx(0.0)
     assert summary["limit_violations"] == 0
-    assert summary["mpc"]["rate_hz"] == pytest.approx(20.0, rel=0.02)
+    assert summary["mpc"]["rate_hz"] == pytest.approx(19.9)
     assert summary["mpc"]["compute_ms"] == {"p50": 3.0, "p99": 5.0, "max": 9.0}
     assert summary["mpc"]["deadline_misses"] == 1
     assert summary["drift"]["median_distance_m"] == pytest.approx(0.02)
@@ -208,14 +227,20 @@ def test_each_shortcoming_fails_the_run():
         ({"phases": late}, "knock"),
         ({"drift": {"median_distance_m": 0.03}}, "30 mm"),
         ({"drift": {"median_distance_m": math.nan}}, "drift"),
-        ({"limit_violations": 2, "limit_violations_by_kind": {"measured_torque": 2}}, "measured_torque"),
+        (
+            {"limit_violations": 2, "limit_violations_by_kind": {"driver_torque": 2, "driver_other": 0}},
+            "driver_torque",
+        ),
+        ({"limit_violations_by_kind": {}}, "driver did not say"),
+        ({"mpc": {**base["mpc"], "rate_hz": 19.6}}, "19.60 plans"),
+        ({"mpc": {**base["mpc"], "rate_hz": math.nan}}, "plans per simulated second"),
         ({"mpc": {**base["mpc"], "deadline_miss_fraction": 0.02}}, "2.0%"),
         ({"mpc": {**base["mpc"], "deadline_miss_fraction": math.nan}}, "deadlines"),
         ({"tool_height_deviation_m": 0.006}, "6.0 mm"),
     ]:
         found = failures({**base, **change})
         assert len(found) == 1 and word in found[0]
-    trouble = RunFacts(3, 1.5, 5.0, ["mpc_planner exited with status 1"], 0.02)
+    trouble = dataclasses.replace(FACTS, trouble=["mpc_planner exited with status 1"])
     assert not summarize(good_run(), good_story(), fr3_pusher(), trouble)["success"]
 
 
@@ -223,7 +248,6 @@ def test_violations_are_counted_wherever_they_happen():
     robot, run = fr3_pusher(), good_run()
     assert sum(limit_violations(run, robot).values()) == 0
     run.joints.velocity[5, 2] = 1.01 * robot.limits.velocity[2]
-    run.joints.effort[7, 6] = -1.01 * robot.torque_limits[6]
     run.joints.position[9, 3] = robot.limits.upper[3] + 1e-3
     start = run.joints.position[0]
     # A cubic between two resting points is fastest half-way: 1.5 times the mean, between its points.
@@ -234,6 +258,84 @@ def test_violations_are_counted_wherever_they_happen():
     assert counts == {
         "measured_position": 1,
         "measured_velocity": 1,
-        "measured_torque": 1,
         "published_trajectory": 1,
+        "driver_reference_position": 0,
+        "driver_joint_velocity": 0,
+        "driver_torque": 0,
+        "driver_other": 0,
     }
+
+
+def test_torques_that_were_asked_for_count_but_not_ramped_ones():
+    robot, run = fr3_pusher(), good_run()
+    # The driver sums up all kinds; a torque beyond its limit is one of them.
+    asked = {"limit_violations": "3", "limit.torque.instants": "3"}
+    run.diagnostics["franka_driver"] = [driver_status(**asked)]
+    counts = limit_violations(run, robot)
+    assert counts["driver_torque"] == 3 and sum(counts.values()) == 3
+    summary = summarize(run, good_story(), robot, FACTS)
+    assert summary["failures"] == ["3 limit violations (driver_torque)"]
+    run.diagnostics["franka_driver"] = [driver_status(limit_violations="2")]
+    assert limit_violations(run, robot)["driver_other"] == 2
+
+
+def test_the_verdict_takes_the_keys_that_the_driver_has():
+    from sim_bridge import driver_messages
+    from sim_bridge.simulation import Simulation
+
+    simulation = Simulation()
+    values = {key: str(value) for key, value in driver_messages.figures(simulation).items()}
+    run = good_run()
+    run.diagnostics["franka_driver"] = [Status(10.0, 0, "ok", values)]
+    counts = limit_violations(run, fr3_pusher())
+    assert {"driver_torque", "driver_reference_acceleration", "driver_other"} <= set(counts)
+    assert "driver_torque_rate" not in counts and sum(counts.values()) == 0
+    demand, still, q = np.zeros((2, 7)), np.zeros(7), simulation.joint_position
+    demand[:, 3] = 1.5
+    simulation.limits.observe(q, still, still, q, still, demand)
+    values = {key: str(value) for key, value in driver_messages.figures(simulation).items()}
+    run.diagnostics["franka_driver"] = [Status(10.0, 0, "ok", values)]
+    assert sum(limit_violations(run, fr3_pusher()).values()) == simulation.limits.violations == 1
+
+
+def counters(time, cycles, misses, skipped):
+    values = {"cycles": cycles, "deadline_misses": misses, "skipped_cycles": skipped}
+    return Status(time, 0, "", {key: str(value) for key, value in values.items()})
+
+
+def rate_of(*statuses, start=2.0, end=12.0):
+    run = good_run()
+    run.diagnostics["mpc_planner"] = list(statuses)
+    return planner_figures(run, start, end, 20.0)
+
+
+def test_the_planning_rate_is_what_the_planner_counted_in_simulated_time():
+    # The recording holds 20 trajectories a second all the same; a recorder that lost some would not matter.
+    half = rate_of(counters(1.5, 0, 0, 0), counters(7.0, 50, 0, 0), counters(12.0, 100, 0, 0))
+    assert half["rate_hz"] == pytest.approx(10.0)
+    full = rate_of(counters(1.5, 0, 0, 0), counters(12.5, 210, 0, 0), counters(13.5, 230, 0, 0))
+    assert full["rate_hz"] == pytest.approx(20.0)
+
+
+def test_skipped_cycles_are_misses_and_what_was_before_the_start_dilutes_nothing():
+    # Of 200 cycles that were due, 10 were skipped and 5 came late; the planner's misses hold both.
+    figures = rate_of(counters(1.9, 1000, 3, 2), counters(12.0, 1190, 18, 12))
+    assert (figures["cycles"], figures["deadline_misses"], figures["skipped_cycles"]) == (200, 15, 10)
+    assert figures["deadline_miss_fraction"] == pytest.approx(0.075)
+    assert figures["rate_hz"] == pytest.approx(18.5)
+
+
+def test_a_planner_that_falls_silent_is_not_taken_to_have_gone_on():
+    assert rate_of(counters(7.0, 100, 0, 0))["rate_hz"] == pytest.approx(10.0)
+    for figures in (rate_of(), rate_of(counters(1.0, 100, 0, 0))):
+        assert math.isnan(figures["rate_hz"]) and math.isnan(figures["deadline_miss_fraction"])
+    assert math.isnan(rate_of(counters(12.0, 0, 0, 0))["deadline_miss_fraction"])
+
+
+def test_the_length_of_a_recording_is_that_with_a_target():
+    assert good_run().duration() == pytest.approx(10.0)
+    empty = PoseSeries(np.empty(0), np.empty((0, 3)))
+    assert dataclasses.replace(good_run(), goal=empty).duration() == 0.0
+    assert dataclasses.replace(good_run(), object=empty).duration() == 0.0
+    none = JointSeries(np.empty(0), *[np.empty((0, 7))] * 3)
+    assert dataclasses.replace(good_run(), joints=none).duration() == 0.0

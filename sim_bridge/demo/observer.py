@@ -28,10 +28,15 @@ from visualization_msgs.msg import MarkerArray
 from sim_bridge.demo.scenario import Orders, Scenario
 from sim_bridge.report.bag import BagRecorder
 from sim_bridge.report.recording import GOAL_POSE, GROUND_TRUTH, JOINT_STATES, JOINT_TRAJECTORY, planar
+from vpsto_ros.exceptions import VpstoError
 from vpsto_ros.robot.kinematics import forward_kinematics_batch
 
 CLOCK, DISTURBANCE = "/clock", "/disturbance"
-GOAL_PERIOD = 0.05
+DIAGNOSTICS = "/diagnostics"
+GOAL_PERIOD, GOAL_REPEAT = 0.05, 0.5
+"""How often a moving target is published, and one that stands, lest its one message be lost [s]."""
+MOVING = 1e-3
+"""A plan that moves no joint farther is no motion [rad]."""
 LATCHED = {
     "/contact_plan": Odometry,
     "/franka_driver/markers": MarkerArray,
@@ -51,7 +56,7 @@ TOPICS = {
     "/object_belief": PoseArray,
     "/external_wrench": WrenchStamped,
     DISTURBANCE: WrenchStamped,
-    "/diagnostics": DiagnosticArray,
+    DIAGNOSTICS: DiagnosticArray,
     **LATCHED,
 }
 
@@ -78,6 +83,7 @@ class Observer(Node):
         self._goal_published = -math.inf
         self.simulated_time = 0.0
         self.first_plan: float | None = None
+        self._reported: dict[str, float] = {}
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, QoSProfile(depth=1))
         self._forces = self.create_publisher(WrenchStamped, DISTURBANCE, QoSProfile(depth=5))
         for topic, kind in TOPICS.items():
@@ -127,11 +133,24 @@ class Observer(Node):
             self._latest[topic] = data
             self._bag.write(topic, self.simulated_time, data)
             if topic == JOINT_TRAJECTORY and self._goal is not None and self.first_plan is None:
-                self.first_plan = time.monotonic()
+                now = time.monotonic()
+                if moves(deserialize_message(data, JointTrajectory)):
+                    self.first_plan = now
+            if topic == DIAGNOSTICS:
+                self._note_report(deserialize_message(data, DiagnosticArray))
             if topic == GROUND_TRUTH and self._running:
                 self._act()
 
         return receive
+
+    def reported_since(self, name: str, seconds: float) -> bool:
+        """Whether a node has published diagnostics at or after a simulated time [s]."""
+        return self._reported.get(name, -math.inf) >= seconds
+
+    def _note_report(self, message: DiagnosticArray) -> None:
+        stamp = message.header.stamp
+        for status in message.status:
+            self._reported[status.name] = stamp.sec + 1e-9 * stamp.nanosec
 
     def _act(self) -> None:
         message, joints = self.latest(GROUND_TRUTH), self.joints()
@@ -144,7 +163,8 @@ class Observer(Node):
 
     def _carry_out(self, orders: Orders, now: float) -> None:
         changed = self._goal is None or not np.allclose(orders.goal, self._goal, atol=1e-9)
-        if changed and (not orders.goal_moves or now - self._goal_published >= GOAL_PERIOD):
+        age = now - self._goal_published
+        if age >= GOAL_REPEAT or (changed and (not orders.goal_moves or age >= GOAL_PERIOD)):
             self._goal, self._goal_published = orders.goal, now
             message = PoseStamped()
             message.header.frame_id = self._frame
@@ -158,6 +178,13 @@ class Observer(Node):
             wrench.header.stamp = _stamp(now)
             wrench.wrench.force.x, wrench.wrench.force.y = map(float, orders.force)
             self._forces.publish(wrench)
+
+
+def moves(message: JointTrajectory) -> bool:
+    """Whether a trajectory leads anywhere; a planner without a way sends one that rests."""
+    if len(message.points) < 2:
+        return False
+    return bool(np.ptp([point.positions for point in message.points], axis=0).max() > MOVING)
 
 
 class Activity:
@@ -199,8 +226,18 @@ class Spinning:
     def _spin(self) -> None:
         try:
             self._executor.spin()
-        except BaseException as error:  # handed to the main thread, which sees `failure`
+        except BaseException as error:  # handed to the main thread by `check`
             self.failure = error
+
+    def check(self) -> None:
+        """Whoever waits for what the callbacks do has to ask this again and again.
+
+        Raises:
+            VpstoError: a callback failed, so that none is executed any more.
+        """
+        if self.failure is not None:
+            kind = type(self.failure).__name__
+            raise VpstoError(f"the demo's own node failed: {kind}: {self.failure}") from self.failure
 
     def __enter__(self) -> Spinning:
         self._thread.start()

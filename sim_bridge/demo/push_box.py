@@ -12,8 +12,8 @@ import signal
 import sys
 import time
 import webbrowser
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from sim_bridge.demo.scenario import Phase, Scenario
 from sim_bridge.demo.settings import Settings
 from sim_bridge.report.bag import BagRecorder
 from sim_bridge.report.recording import Recording
-from sim_bridge.report.summary import RunFacts, summarize
+from sim_bridge.report.summary import DRIVER, PLANNER, RunFacts, summarize
 from vpsto_ros.exceptions import VpstoError
 from vpsto_ros.robot.kinematics import fr3_pusher
 
@@ -41,6 +41,10 @@ NODES = {
 }
 START_PATIENCE = 180.0
 """How long the nodes may take to become active [s]; without a kernel cache they compile first."""
+REPORT_PATIENCE = 3.0
+"""How long to wait for the nodes' last diagnostics [s]; they come once a second."""
+SHORTEST_RUN = 0.2
+"""A shorter recording [s] cannot be drawn."""
 
 
 @dataclass
@@ -57,7 +61,7 @@ class Outcome:
     scenario: Scenario
     first_plan: float = math.nan
     elapsed: float = math.nan
-    trouble: list[str] | None = None
+    trouble: list[str] = field(default_factory=list)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -81,13 +85,20 @@ def run(arguments: argparse.Namespace) -> int:
         outcome = _run_nodes(arguments, settings, bag, out)
     finally:
         bag.close()
-    print("making pictures, replay and video ...", flush=True)
     recording = Recording.from_bag(out / "bag")
+    if recording.duration() < SHORTEST_RUN or math.isnan(outcome.scenario.phases[0].start):
+        return _give_up(out, arguments.seed, outcome)
     facts = RunFacts(
-        arguments.seed, outcome.first_plan, outcome.elapsed, outcome.trouble or [], settings.scene.tool_height
+        arguments.seed,
+        outcome.first_plan,
+        outcome.elapsed,
+        outcome.trouble,
+        settings.scene.tool_height,
+        settings.planner_rate,
     )
     summary = summarize(recording, outcome.scenario, fr3_pusher(), facts)
-    (out / "summary.json").write_text(json.dumps(_plain(summary), indent=2) + "\n")
+    _write_summary(out, summary)
+    print("making pictures, replay and video ...", flush=True)
     notes = write_artifacts(out, recording, summary, settings, verdict(summary))
     print(verdict(summary))
     for note in notes:
@@ -96,16 +107,40 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if summary["success"] else 1
 
 
+def _give_up(out: Path, seed: int, outcome: Outcome) -> int:
+    """The verdict on a run that ended before there was anything to draw."""
+    trouble = [*outcome.trouble, "the run ended before the arm could do anything"]
+    summary = {
+        "success": False,
+        "failures": trouble,
+        "time_to_first_plan_s": outcome.first_plan,
+        "seed": seed,
+    }
+    _write_summary(out, summary)
+    print(verdict(summary))
+    print(f"logs of the nodes: {out / 'logs'}")
+    return 1
+
+
+def _write_summary(out: Path, summary: dict[str, Any]) -> None:
+    (out / "summary.json").write_text(json.dumps(_plain(summary), indent=2) + "\n")
+
+
 def verdict(summary: dict[str, Any]) -> str:
     """The outcome in plain words."""
+    first = summary["time_to_first_plan_s"]
+    plan = f"the first plan that moves came {first:.1f} s after the start"
+    if not math.isfinite(first):
+        plan = "no plan that moves came"
     if not summary["success"]:
-        return "FAILED: " + "; ".join(summary["failures"])
+        return "FAILED: " + "; ".join([*summary["failures"], plan])
     times = [phase["time_to_reach_s"] for phase in summary["phases"] if phase["name"] != "drift"]
     return (
         f"SUCCESS: the box came to rest at every target within {max(times):.1f} s, kept "
         f"{summary['drift']['median_distance_m'] * 1e3:.0f} mm to the drifting one (median) and ended "
         f"{summary['final_error_m'] * 1e3:.1f} mm from it; no limit was violated, "
-        f"{summary['mpc']['deadline_misses']:.0f} of {summary['mpc']['cycles']:.0f} deadlines were missed."
+        f"{summary['mpc']['deadline_misses']:.0f} of {summary['mpc']['cycles']:.0f} deadlines were missed at "
+        f"{summary['mpc']['rate_hz']:.1f} plans per second; {plan}."
     )
 
 
@@ -121,25 +156,35 @@ def _run_nodes(arguments: argparse.Namespace, settings: Settings, bag: BagRecord
             processes.start(name, [sys.executable, "-c", code, *settings.ros_arguments(name)])
         # Whoever watches and records must not take time from those who plan and drive.
         os.nice(5)
-        with _observer(bag, scenario, environment) as observer:
-            _wait_until_active(observer, processes)
+        with _observer(bag, scenario, environment) as (observer, spinning):
+            _wait_until_active(observer, spinning, processes)
             with _viewer(arguments.viewer, settings) as show:
                 started = time.monotonic()
                 observer.begin()
                 patience = 60.0 + 4.0 * arguments.duration / min(arguments.real_time_factor, 1.0)
-                _watch(observer, processes, scenario, show, started + patience)
+                _watch(observer, spinning, processes, scenario, show, started + patience)
             outcome.elapsed = time.monotonic() - started
+            _await_reports(observer, scenario)
             if observer.first_plan is not None:
                 outcome.first_plan = observer.first_plan - began
             ended = processes.ended()
-        outcome.trouble = [f"{name} ended during the run" for name in ended]
         if not scenario.finished and not ended:
             outcome.trouble.append("the simulation did not get to the end of the scenario in time")
-        codes = processes.stop()
-    outcome.trouble += [f"{name} exited with status {code}" for name, code in codes.items() if code != 0]
-    for name in (name for name, status in codes.items() if status != 0):
-        print(f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}", file=sys.stderr)
+        processes.stop()
+    outcome.trouble += _trouble(processes, ended)
     return outcome
+
+
+def _trouble(processes: ProcessGroup, ended: Collection[str]) -> list[str]:
+    """What is to be said about stopped processes, those that ended by themselves among them."""
+    found = []
+    for name, code in processes.exit_codes.items():
+        if name not in ended and code == 0:
+            continue
+        what = f"ended during the run with status {code}" if name in ended else f"exited with status {code}"
+        log = f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}\n"
+        found.append(f"{name} {what}, {log}")
+    return found
 
 
 def _private_network() -> dict[str, str]:
@@ -156,25 +201,28 @@ def _private_network() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _observer(bag: BagRecorder, scenario: Scenario, environment: dict[str, str]) -> Iterator[Observer]:
+def _observer(
+    bag: BagRecorder, scenario: Scenario, environment: dict[str, str]
+) -> Iterator[tuple[Observer, Spinning]]:
     # Signals are ours: Ctrl-C must reach the code that stops the processes.
     rclpy.init(domain_id=int(environment["ROS_DOMAIN_ID"]), signal_handler_options=SignalHandlerOptions.NO)
     observer = Observer(bag, scenario)
     try:
-        with Spinning(observer):
-            yield observer
+        with Spinning(observer) as spinning:
+            yield observer, spinning
     finally:
         observer.destroy_node()
         rclpy.try_shutdown()
 
 
-def _wait_until_active(observer: Observer, processes: ProcessGroup) -> None:
+def _wait_until_active(observer: Observer, spinning: Spinning, processes: ProcessGroup) -> None:
     print("starting the nodes ...", flush=True)
     activity = Activity(observer, tuple(NODES))
     deadline = time.monotonic() + START_PATIENCE
     while not (
         activity.poll() and observer.subscribers_of_goal() >= 2 and observer.object_pose() is not None
     ):
+        spinning.check()
         for name in processes.ended():
             log = f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}"
             raise VpstoError(f"{name} ended while starting; {log}")
@@ -184,14 +232,34 @@ def _wait_until_active(observer: Observer, processes: ProcessGroup) -> None:
         time.sleep(0.02)
 
 
+def _await_reports(observer: Observer, scenario: Scenario) -> None:
+    """Wait for the diagnostics that see all of the scenario, but not for a node that hangs."""
+    deadline = time.monotonic() + REPORT_PATIENCE
+    end = scenario.phases[-1].end if scenario.finished else -math.inf
+    while not all(observer.reported_since(name, end) for name in (DRIVER, PLANNER)):
+        if time.monotonic() > deadline:
+            return
+        time.sleep(0.02)
+
+
 def _watch(
-    observer: Observer, processes: ProcessGroup, scenario: Scenario, show: Any, deadline: float
+    observer: Observer,
+    spinning: Spinning,
+    processes: ProcessGroup,
+    scenario: Scenario,
+    show: Any,
+    deadline: float,
 ) -> None:
-    """Show progress until the scenario is over, a process has ended or the deadline has passed."""
+    """Show progress until the scenario is over, a process has ended or the deadline has passed.
+
+    Raises:
+        VpstoError: the observer failed.
+    """
     announced: set[str] = set()
     with tqdm(total=100, disable=None, bar_format="{desc} |{bar}| {elapsed}") as bar:
         while not scenario.finished and not processes.ended() and time.monotonic() < deadline:
             time.sleep(0.05)
+            spinning.check()
             show(observer)
             _announce(scenario, announced)
             pose, goal = observer.object_pose(), observer.goal()
@@ -202,6 +270,7 @@ def _watch(
                 )
             bar.n = round(100 * scenario.progress)
             bar.refresh()
+    spinning.check()
     _announce(scenario, announced)
 
 

@@ -69,7 +69,7 @@ def demo_tables(summary: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]
         ],
         ["limit violations", str(summary["limit_violations"])],
         ["largest deviation of the tool's height", number(summary["tool_height_deviation_m"], 1e3, "mm", 2)],
-        ["plans per second", number(mpc["rate_hz"], 1.0, "Hz", 1)],
+        ["plans per simulated second", number(mpc["rate_hz"], 1.0, "Hz", 1)],
         [
             "compute time p50 / p99 / max",
             " / ".join(number(compute[key], 1.0, "", 1) for key in compute) + " ms",

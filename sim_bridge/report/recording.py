@@ -43,6 +43,8 @@ class PoseSeries:
 
     def held(self, time: FloatArray) -> FloatArray:
         """The latest pose (M, 3) at other times (M,), for a target that jumps; NaN before the first."""
+        if not len(self.time):
+            return np.full((len(time), 3), np.nan)
         index = np.searchsorted(self.time, time, side="right") - 1
         return np.where((index >= 0)[:, None], self.pose[np.maximum(index, 0)], np.nan)
 
@@ -76,7 +78,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Status:
-    """One node's diagnostics at a time [s]: level 0 to 3 (ok, warning, error, stale), message, values."""
+    """One node's diagnostics: their stamp [s], level 0 to 3 (ok, warning, error, stale), message, values."""
 
     time: float
     level: int
@@ -116,6 +118,13 @@ class Recording:
         distance = np.linalg.norm(self.object.pose[:, :2] - goal[:, :2], axis=1)
         known = np.isfinite(distance)
         return self.object.time[known], distance[known]
+
+    def duration(self) -> float:
+        """How long joints and object were recorded with a target [s]; 0 when one is missing."""
+        time, _ = self.distance()
+        if not len(time) or not len(self.joints.time):
+            return 0.0
+        return max(float(min(time[-1], self.joints.time[-1]) - time[0]), 0.0)
 
 
 class _Reader:
@@ -178,9 +187,11 @@ class _Reader:
         self.commands.append(Command(seconds, time, np.array([p.positions for p in points]), *parts))
 
     def _diagnostic(self, seconds: float, message: Any) -> None:
+        # By the time of the report: a recorder on a busy machine may read it late.
+        reported = _stamp(message) or seconds
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            entry = Status(seconds, int(status.level), status.message, values)
+            entry = Status(reported, int(status.level), status.message, values)
             self.diagnostics.setdefault(status.name, []).append(entry)
 
 

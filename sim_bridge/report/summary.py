@@ -15,9 +15,11 @@ from vpsto_ros.robot.kinematics import Robot, forward_kinematics_batch
 from vpsto_ros.trajectory import Limits, Trajectory
 
 DRIVER, PLANNER = "franka_driver", "mpc_planner"
-TORQUE_RATE = "limit.torque_rate.instants"
 ALLOWED_DEADLINE_MISSES = 0.01
+REQUIRED_RATE = 0.99
+"""Share of the configured planning rate that has to be kept."""
 ALLOWED_HEIGHT_DEVIATION = 0.005
+_SILENCE = Status(math.nan, 0, "", {})
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class RunFacts:
         elapsed: wall time while the scenario ran [s].
         trouble: processes that ended early or badly, in words.
         tool_height: nominal height of the tool's tip above the table [m].
+        planner_rate: the configured planning rate [Hz].
     """
 
     seed: int
@@ -37,6 +40,7 @@ class RunFacts:
     elapsed: float
     trouble: Sequence[str]
     tool_height: float
+    planner_rate: float
 
 
 def summarize(recording: Recording, scenario: Scenario, robot: Robot, facts: RunFacts) -> dict[str, Any]:
@@ -44,14 +48,16 @@ def summarize(recording: Recording, scenario: Scenario, robot: Robot, facts: Run
     _, distance = recording.distance()
     limits = limit_violations(recording, robot)
     heights = forward_kinematics_batch(recording.joints.position)[:, 2]
-    start, end = scenario.phases[0].start, recording.object.time[-1]
+    start, end = scenario.phases[0].start, scenario.phases[-1].end
+    if not math.isfinite(end):
+        end = recording.object.time[-1]
     summary: dict[str, Any] = {
         "success": False,
         "failures": [],
         "final_error_m": float(distance[-1]),
         "limit_violations": sum(limits.values()),
         "limit_violations_by_kind": limits,
-        "mpc": planner_figures(recording, start, end),
+        "mpc": planner_figures(recording, start, end, facts.planner_rate),
         "time_to_first_plan_s": facts.first_plan,
         "tool_height_deviation_m": float(np.abs(heights - facts.tool_height).max()),
         "phases": [_phase_figures(phase) for phase in scenario.phases],
@@ -73,26 +79,39 @@ def summarize(recording: Recording, scenario: Scenario, robot: Robot, facts: Run
 def limit_violations(recording: Recording, robot: Robot) -> dict[str, int]:
     """How often a limit was exceeded, by kind.
 
-    Positions, velocities and torques count per joint state; a published trajectory counts when it
-    exceeds a position, velocity or acceleration limit at any instant. What the driver counted is added, not
-    changes of torque that were asked for too fast: the controller cuts those before they reach the arm.
+    Positions and velocities count per joint state; a published trajectory counts when it exceeds a position,
+    velocity or acceleration limit at any instant. What the driver counted at every control cycle is added:
+    see :func:`driver_violations`. Measured torques are not looked at: the controller cuts them to their
+    limits, so that only the driver knows which torques were asked for.
     """
     joints, limits = recording.joints, robot.limits
     lower, upper = robot.position_range
-    counts = {
+    return {
         "measured_position": _count(joints, (joints.position < lower) | (joints.position > upper)),
         "measured_velocity": _count(joints, np.abs(joints.velocity) > limits.velocity),
-        "measured_torque": _count(joints, np.abs(joints.effort) > robot.torque_limits),
         "published_trajectory": sum(
             bool(command_violations(command, limits)) for command in recording.commands
         ),
+        **driver_violations(recording.diagnostics.get(DRIVER, [])),
     }
-    statuses = recording.diagnostics.get(DRIVER, [])
-    if statuses:
-        for key in statuses[-1].values:
-            if key.startswith("limit.") and key.endswith(".instants") and key != TORQUE_RATE:
-                counts["driver_" + key.split(".")[1]] = int(statuses[-1].number(key))
-    return counts
+
+
+def driver_violations(statuses: Sequence[Status]) -> dict[str, int]:
+    """The driver's ``limit_violations``, split into the kinds ``limit.<kind>.instants``, torque among them.
+
+    ``demand.*`` is no part of it: changes of torque that were asked for too fast and that the controller cut.
+
+    Returns:
+        Instants by kind, "driver_other" being what the kinds do not explain; empty when the driver said
+        nothing of limits, which :func:`failures` takes for a failure.
+    """
+    if not statuses or not math.isfinite(statuses[-1].number("limit_violations")):
+        return {}
+    last = statuses[-1]
+    keys = [key for key in last.values if key.startswith("limit.") and key.endswith(".instants")]
+    counts = {"driver_" + key.split(".")[1]: int(last.number(key)) for key in keys}
+    other = int(last.number("limit_violations")) - sum(counts.values())
+    return {**counts, "driver_other": max(other, 0)}
 
 
 def command_violations(command: Command, limits: Limits) -> list[str]:
@@ -104,20 +123,61 @@ def command_violations(command: Command, limits: Limits) -> list[str]:
     return trajectory.violations(limits, relative_tolerance=1e-4)
 
 
-def planner_figures(recording: Recording, start: float, end: float) -> dict[str, Any]:
-    """Rate, compute time and deadline misses of the planner between two times [s]."""
-    received = np.array([command.received for command in recording.commands])
-    count = int(np.count_nonzero((received >= start) & (received <= end)))
-    statuses = [status for status in recording.diagnostics.get(PLANNER, []) if status.time >= start]
-    last = statuses[-1] if statuses else Status(math.nan, 0, "", {})
-    misses, cycles = last.number("deadline_misses"), last.number("cycles")
+def planner_figures(recording: Recording, start: float, end: float, rate: float) -> dict[str, Any]:
+    """How the planner kept its rate and deadlines between two times [s], by its own counters.
+
+    A cycle counts when there was something to plan; ``deadline_misses`` of the planner contains the cycles
+    that it skipped as well as those whose plan was late. What was counted before ``start`` is subtracted. If
+    the planner's last report is from before ``end``, nothing is assumed to have been planned since.
+
+    Args:
+        recording: the run.
+        start: when the first target was given.
+        end: of the scenario.
+        rate: the configured one [Hz].
+
+    Returns:
+        Plans ready in time per simulated second, cycles that were due, those missed and skipped, compute
+        times since the planner's start; NaN where the planner said nothing.
+    """
+    statuses = recording.diagnostics.get(PLANNER, [])
+    before = [status for status in statuses if status.time <= start]
+    within = [status for status in statuses if status.time > start]
+    # The first report at or after the end sees all of the scenario and least of what follows.
+    last = next((status for status in within if status.time >= end), within[-1] if within else _SILENCE)
+    duration = max(last.time, end) - start if within else math.nan
+
+    def counted(key: str) -> float:
+        return last.number(key) - (before[-1].number(key) if before else 0.0)
+
+    misses, skipped = counted("deadline_misses"), counted("skipped_cycles")
+    due = counted("cycles") + skipped
     return {
-        "rate_hz": count / (end - start),
+        "rate_hz": (due - misses) / duration,
+        "configured_rate_hz": rate,
+        "duration_s": duration,
         "compute_ms": {key: last.number(f"compute_{key}_ms") for key in ("p50", "p99", "max")},
         "deadline_misses": misses,
-        "cycles": cycles,
-        "deadline_miss_fraction": misses / cycles if cycles else math.nan,
+        "skipped_cycles": skipped,
+        "cycles": due,
+        "deadline_miss_fraction": misses / due if due > 0.0 else math.nan,
     }
+
+
+def planner_failures(mpc: Mapping[str, Any]) -> list[str]:
+    """What was wrong with the planner's timing, in words."""
+    found = []
+    fraction, rate, configured = (
+        mpc[key] for key in ("deadline_miss_fraction", "rate_hz", "configured_rate_hz")
+    )
+    if not fraction <= ALLOWED_DEADLINE_MISSES:
+        found.append(f"the planner missed {fraction:.1%} of its deadlines, allowed is 1 %")
+    # The first cycle after the first target comes up to a period later.
+    if not rate + 1.0 / mpc["duration_s"] >= REQUIRED_RATE * configured:
+        found.append(
+            f"the planner made {rate:.2f} plans per simulated second, required is 99 % of {configured:g}"
+        )
+    return found
 
 
 def failures(summary: Mapping[str, Any]) -> list[str]:
@@ -136,9 +196,9 @@ def failures(summary: Mapping[str, Any]) -> list[str]:
     if summary["limit_violations"]:
         kinds = [kind for kind, count in summary["limit_violations_by_kind"].items() if count]
         found.append(f"{summary['limit_violations']} limit violations ({', '.join(kinds)})")
-    fraction = summary["mpc"]["deadline_miss_fraction"]
-    if not fraction <= ALLOWED_DEADLINE_MISSES:
-        found.append(f"the planner missed {fraction:.1%} of its deadlines, allowed is 1 %")
+    if "driver_other" not in summary["limit_violations_by_kind"]:
+        found.append("the driver did not say whether it saw limits violated")
+    found.extend(planner_failures(summary["mpc"]))
     deviation = summary["tool_height_deviation_m"]
     if not deviation <= ALLOWED_HEIGHT_DEVIATION:
         found.append(f"the tool left its height by {deviation * 1e3:.1f} mm, allowed are 5 mm")
