@@ -42,3 +42,11 @@ def test_every_row_measures_something(monkeypatch):
     )
     for measure in (bench.synthesis, bench.vpsto_iteration):
         assert measure()["p50_ms"] > 0.0
+
+
+def test_the_row_of_the_driver_node_is_there_with_ros_and_leaves_no_context():
+    rclpy = pytest.importorskip("rclpy")
+    row = bench.BENCHMARKS["driver_node"]()
+    assert row["p50_ms"] > 0.0
+    assert row["real_time_factor"] == pytest.approx(1e3 / row["p50_ms"])
+    assert not rclpy.ok()

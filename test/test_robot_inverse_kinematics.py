@@ -98,33 +98,6 @@ def test_velocities_map_there_and_back(table):
     np.testing.assert_allclose(table.joint_velocity(points[0], velocity[0]), qd[0])
 
 
-@pytest.mark.parametrize("annulus", [(0.31, 0.5), (0.35, 0.6), (0.31, 0.7)])
-@pytest.mark.parametrize("speed", [0.2, 0.35])
-def test_every_motion_within_plane_limits_keeps_the_joint_limits(table, annulus, speed):
-    v, a = table.plane_limits(*annulus, speed)
-    limits = fr3_pusher().limits
-    rng = np.random.default_rng(8)
-    radius, angle = rng.uniform(*annulus, 20000), rng.uniform(-np.pi, np.pi, 20000)
-    radius[:2000] = annulus[0]
-    radius[2000:4000] = annulus[1]
-    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-    velocity, acceleration = rng.uniform(-v, v, (20000, 2)), rng.uniform(-a, a, (20000, 2))
-    velocity[::2], acceleration[::3] = v * np.sign(velocity[::2]), a * np.sign(acceleration[::3])
-    _, qd, qdd = table.joint_motion(points, velocity, acceleration)
-    assert np.all(np.abs(qd) <= limits.velocity)
-    assert np.all(np.abs(qdd) <= limits.acceleration)
-    # ... and they are not needlessly small: somewhere nearly all of a limit is used.
-    shares = np.maximum(np.abs(qdd) / limits.acceleration, np.abs(qd) / limits.velocity)
-    assert shares.max() > 0.85
-
-
-def test_plane_limits_say_what_is_wrong(table):
-    with pytest.raises(InvalidInputError, match="r_min"):
-        table.plane_limits(0.2, 0.5)
-    with pytest.raises(InfeasibleError, match="lower the speed"):
-        table.plane_limits(0.31, 0.79, 1.0)
-
-
 def test_out_of_reach_is_an_error_not_a_nan(table):
     assert not table.contains([0.9, 0.0])
     assert table.contains([[0.5, 0.1], [0.1, 0.1]]).tolist() == [True, False]

@@ -7,7 +7,6 @@ import contextlib
 import json
 import math
 import os
-import random
 import signal
 import sys
 import time
@@ -24,7 +23,7 @@ from tqdm import tqdm
 
 from sim_bridge.demo.artifacts import write_artifacts
 from sim_bridge.demo.observer import Activity, Observer, Spinning
-from sim_bridge.demo.processes import ProcessGroup
+from sim_bridge.demo.processes import ProcessGroup, private_network
 from sim_bridge.demo.scenario import Phase, Scenario
 from sim_bridge.demo.settings import Settings
 from sim_bridge.report.bag import BagRecorder
@@ -148,7 +147,7 @@ def _run_nodes(arguments: argparse.Namespace, settings: Settings, bag: BagRecord
     """From the first process to the last."""
     scenario = Scenario(np.random.default_rng(arguments.seed), arguments.duration)
     outcome = Outcome(scenario)
-    environment = _private_network()
+    environment = private_network()
     began = time.monotonic()
     with ProcessGroup(out / "logs", environment) as processes:
         for name, module in NODES.items():
@@ -185,19 +184,6 @@ def _trouble(processes: ProcessGroup, ended: Collection[str]) -> list[str]:
         log = f"the last lines of {processes.log_path(name)}:\n{processes.last_lines(name)}\n"
         found.append(f"{name} {what}, {log}")
     return found
-
-
-def _private_network() -> dict[str, str]:
-    """A ROS domain of our own on this machine: other ROS programs neither disturb the demo nor hear it."""
-    environment = {
-        # Linux leaves room for 102 domains below its ephemeral ports.
-        "ROS_DOMAIN_ID": str(random.SystemRandom().randrange(1, 102)),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "OPENBLAS_NUM_THREADS": "1",
-        "PYTHONUNBUFFERED": "1",
-    }
-    os.environ.update(environment)
-    return environment
 
 
 @contextlib.contextmanager

@@ -143,49 +143,6 @@ class TableMap:
         velocity = tip_velocity_batch(q.reshape(-1, 7), qd.reshape(-1, 7))
         return velocity[:, :2].reshape(*q.shape[:-1], 2)
 
-    def plane_limits(
-        self, r_min: float, r_max: float, speed: float = 0.35, *, margin: float = 0.02
-    ) -> tuple[float, float]:
-        """Speed and acceleration per axis with which no motion inside an annulus breaks a joint limit.
-
-        With |v_x|, |v_y| <= v the tip's speed is at most sqrt(2) v in any direction, and likewise for the
-        acceleration. Per radius the largest joint accelerations over all directions are then sums of
-        maxima: joint 1 carries the tangential acceleration and the Coriolis term, |2 v_r v_t| <= 2 v²; the
-        others f' (a_r + v_t²/r) + f'' v_r².
-
-        Args:
-            r_min: inner radius [m].
-            r_max: outer radius [m].
-            speed: wanted speed per axis [m/s]; lowered where the joint velocity limits ask for it.
-            margin: share of every joint limit that is kept in reserve.
-
-        Returns:
-            Speed [m/s] and acceleration [m/s²] per axis.
-
-        Raises:
-            InvalidInputError: the annulus is empty or leaves radius_range.
-            InfeasibleError: at this speed nothing is left for acceleration.
-        """
-        low, high = self.radius_range
-        if not low <= r_min < r_max <= high:
-            raise InvalidInputError(
-                f"need {low:.3f} <= r_min < r_max <= {high:.3f} m, got {r_min} and {r_max}"
-            )
-        r = np.linspace(r_min, r_max, 2001)
-        _, first, second = self.radial(r)
-        slopes = np.column_stack([1.0 / r, np.abs(first)])  # joints 1, 2, 4, 6 per metre
-        bends = np.column_stack([1.0 / r**2, np.maximum(np.abs(first) / r[:, None], np.abs(second))])
-        joints = [0, 1, 3, 5]
-        rate = (1.0 - margin) * self._robot.limits.velocity[joints]
-        force = (1.0 - margin) * self._robot.limits.acceleration[joints]
-        v = float(min(speed, (rate / (np.sqrt(2.0) * slopes)).min()))
-        a = float(((force - 2.0 * v * v * bends) / (np.sqrt(2.0) * slopes)).min())
-        if a <= 0.0:
-            raise InfeasibleError(
-                f"{v:.2f} m/s per axis uses up the joint accelerations on {r_min}-{r_max} m; lower the speed"
-            )
-        return v, a
-
     def _motion(self, points, velocities, accelerations, orders):
         if not points.shape == velocities.shape == accelerations.shape:
             raise InvalidInputError("points, velocities and accelerations must have equal shapes")
