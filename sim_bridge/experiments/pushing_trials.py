@@ -161,6 +161,9 @@ def _knock(loop: PushingLoop, knock: NDArray, workspace: Workspace) -> float:
         knock = length * np.array([np.cos(bearing + turn), np.sin(bearing + turn)])
         if float(workspace.object_excess(np.append(center + knock, 0.0)[None], KNOCK_MARGIN)) == 0.0:
             break
+    else:
+        middle = np.array([np.mean(workspace.object_x), np.mean(workspace.object_y)])
+        knock = length * (middle - center) / np.hypot(*(middle - center))
     sim.knock(knock, duration=0.25)
     loop.advance(0.25)
     return sim.time
