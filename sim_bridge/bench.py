@@ -121,7 +121,7 @@ def driver() -> Row:
 
 
 def driver_node() -> Row:
-    """One simulated second of the driver's node, which publishes at its rates to nobody, as fast as it can."""
+    """One simulated second of the driver's node, which publishes at its rates, as fast as it can."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.parameter import Parameter

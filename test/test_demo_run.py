@@ -77,6 +77,52 @@ def test_no_limit_is_violated(short_run):
     assert json.loads((short_run[0] / "summary.json").read_text())["limit_violations"] == 0
 
 
+KILLING = """
+import sys, time
+from sim_bridge import cli
+from sim_bridge.demo import push_box
+delay, ready = float(sys.argv.pop(1)), push_box._wait_until_active
+
+def wait(observer, spinning, processes):
+    ready(observer, spinning, processes)
+    if not delay:
+        processes._processes["franka_driver"].kill()
+        processes._processes["franka_driver"].wait()
+        observer._latest.clear()
+        time.sleep(0.5)
+
+def act(observer, original=push_box.Observer._act):
+    original(observer)
+    if delay and observer._scenario.phase.start + delay < observer.simulated_time:
+        raise OSError("the disk is full")
+
+push_box._wait_until_active, push_box.Observer._act = wait, act
+sys.exit(cli.main())
+"""
+
+
+def run_killing(out, delay):
+    command = [sys.executable, "-c", KILLING, str(delay), "demo", "push_box", "--out", str(out)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_a_node_that_dies_before_the_first_step_gives_a_verdict(tmp_path):
+    done = run_killing(tmp_path, 0)
+    assert done.returncode == 1 and "Traceback" not in done.stdout + done.stderr
+    assert "FAILED: franka_driver ended during the run with status -9, the last lines of" in done.stdout
+    assert json.loads((tmp_path / "summary.json").read_text())["success"] is False
+    assert nodes_of(tmp_path) == []
+
+
+def test_a_failing_observer_ends_the_run_at_once(tmp_path):
+    began = time.monotonic()
+    done = run_killing(tmp_path, 0.5)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "error: the demo's own node failed: OSError: the disk is full" in done.stderr
+    assert time.monotonic() - began < 60.0
+    assert nodes_of(tmp_path) == []
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_demo_takes_its_nodes_along(tmp_path, number):
     demo = start(tmp_path)
