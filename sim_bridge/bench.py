@@ -135,11 +135,15 @@ def driver_node() -> Row:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=executor.spin, daemon=True)
+
+        def second() -> None:
+            for _ in range(round(1.0 / SLICE)):
+                node.advance()
+
         try:
             node.start()
             thread.start()
-            slices = range(round(1.0 / SLICE))
-            seconds = measure(lambda: [node.advance() for _ in slices], 5)
+            seconds = measure(second, 5)
         finally:
             executor.shutdown(timeout_sec=2.0)
             thread.join(timeout=2.0)
