@@ -35,8 +35,8 @@ class LimitReport:
 class LimitMonitor:
     """Reference, measured motion and torques against the limits of the arm, at every control cycle.
 
-    Torques and torque rates are counted as asked for: the controller cuts them, so that a count says how
-    often it had to.
+    Torques and torque rates are counted as asked for, before the controller cuts them. A torque asked for
+    beyond its limit is a violation; a rate is not, the controller ramps it.
     """
 
     def __init__(self, limits: Limits):
