@@ -26,7 +26,10 @@ from vpsto_ros.trajectory import Trajectory
 
 @dataclasses.dataclass
 class Recording:
-    """What happened, sampled at every planning step; ground truth is for judging only."""
+    """What happened, sampled at every planning step; ground truth is for judging only.
+
+    `compute` is processor time: what other processes on the machine do does not count.
+    """
 
     time: list[float] = dataclasses.field(default_factory=list)
     object_pose: list[NDArray] = dataclasses.field(default_factory=list)
@@ -103,9 +106,9 @@ class PushingLoop:
         contact = None
         if state is not None and self.contact_planner is not None:
             contact = self.contact_planner.plan(now, sim.tool_position()[:2], state, goal)
-        begin = time.perf_counter()
+        begin = time.thread_time()
         step = self.planner.step(now, sim.joint_position, sim.joint_velocity, state, goal, contact)
-        self._record(now, goal, step, time.perf_counter() - begin)
+        self._record(now, goal, step, time.thread_time() - begin)
         self._next_plan = now + self.period
         return step
 
