@@ -95,7 +95,7 @@ def vpsto_iteration() -> Row:
 
 
 def mpc_step() -> Row:
-    """Replanning as in the demo, over ten seconds of closed loop with a goal that jumps every two."""
+    """Replanning as in the demo, ten seconds of closed loop, a goal that jumps every two; processor time."""
     goals = [
         PlanarGoal(np.array(point), None) for point in ((0.55, 0.12), (0.48, -0.12), (0.58, 0.0), (0.45, 0.1))
     ]
