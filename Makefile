@@ -18,7 +18,7 @@ $(STAMP): setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' \
 	  || { echo "vpsto_ros needs Python 3.11 or 3.12, for example: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || { echo "Python has no venv module: apt install python3-venv"; exit 1; }
-	@echo "Installing into $(VENV) (1.2 GB, a minute or two) ..."
+	@echo "Installing into $(VENV) (1.6 GB, a minute or two) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --use-pep517 --editable '.[ros,sim,pycma,test,lint]'
 	@touch $@

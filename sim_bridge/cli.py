@@ -51,6 +51,13 @@ def seed(text: str) -> int:
     return _whole(text, minimum=0)
 
 
+def folder(text: str) -> str:
+    """The path of a folder that exists or can be made, for argparse."""
+    if not text or (os.path.exists(text) and not os.path.isdir(text)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a folder")
+    return text
+
+
 def _whole(text: str, minimum: int) -> int:
     try:
         value = int(text)
@@ -116,10 +123,11 @@ def _demo_arguments(parser: argparse.ArgumentParser, name: str) -> None:
         "--seed", type=seed, default=0, metavar="N", help="of camera noise and search (default 0)"
     )
     parser.add_argument(
-        "--duration", type=positive, default=90.0, metavar="S", help="simulated seconds at most (default 90)"
+        "--duration", type=positive, default=90.0, metavar="S",
+        help="simulated seconds for all targets, shared out among them; the demo needs about 35 (default 90)",
     )
     parser.add_argument(
-        "--out", default=f"output/{name}", metavar="DIR", help=f"results (default output/{name})"
+        "--out", default=f"output/{name}", metavar="DIR", type=folder, help=f"results (default output/{name})"
     )
     parser.add_argument(
         "--viewer", action="store_true", help="open a live 3-D view in the browser, on 127.0.0.1"
@@ -137,7 +145,7 @@ def _experiment_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("--runs", type=count, default=100, metavar="N", help="random episodes (default 100)")
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of the first episode (default 0)")
     out = f"output/experiment_{name}"
-    parser.add_argument("--out", default=out, metavar="DIR", help=f"results (default {out})")
+    parser.add_argument("--out", default=out, metavar="DIR", type=folder, help=f"results (default {out})")
 
 
 def _load(module: str) -> ModuleType:

@@ -55,7 +55,7 @@ def write_artifacts(
     distance_chart(charts[0][0], recording, summary["phases"])
     top_view(charts[1][0], recording, tool, shape.transform(np.zeros(3)))
     joint_chart(charts[2][0], recording, robot.limits, robot.torque_limits)
-    compute_chart(charts[3][0], recording, PLANNER, 1e3 / settings.planner_rate)
+    compute_chart(charts[3][0], recording, PLANNER)
     frames = replay_frames(recording, summary["phases"][0]["start_s"])
     page = replay_page(build(settings.scene), robot.joint_names, frames, FRAME_RATE)
     title = "A simulated FR3 pushes a box to a moving target"

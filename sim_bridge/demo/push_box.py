@@ -202,7 +202,7 @@ def _observer(
 
 
 def _wait_until_active(observer: Observer, spinning: Spinning, processes: ProcessGroup) -> None:
-    print("starting the nodes ...", flush=True)
+    print("starting the nodes; the first time they compile for half a minute ...", flush=True)
     activity = Activity(observer, tuple(NODES))
     deadline = time.monotonic() + START_PATIENCE
     while not (

@@ -113,8 +113,8 @@ def joint_chart(path: Path, recording: Recording, limits: Limits, torque_limits:
     canvas.savefig(path)
 
 
-def compute_chart(path: Path, recording: Recording, node: str, allowed_ms: float) -> None:
-    """Compute time of a replanning step as the planner reports it, and when its plans arrived."""
+def compute_chart(path: Path, recording: Recording, node: str) -> None:
+    """Compute time of replanning since the start as the planner reports it, against its deadline."""
     canvas, axes = figure()
     start = _start(recording)
     statuses = recording.diagnostics.get(node, [])
@@ -122,7 +122,9 @@ def compute_chart(path: Path, recording: Recording, node: str, allowed_ms: float
     for key, style in (("p50", "-"), ("p99", "--"), ("max", ":")):
         values = [status.number(f"compute_{key}_ms") for status in statuses]
         axes.plot(time, values, style, color=TOOL, lw=1.4, label=key)
-    axes.axhline(allowed_ms, color="#b91c1c", lw=1.0, ls="--", label=f"allowed ({allowed_ms:.0f} ms)")
+    if statuses:
+        deadline = statuses[-1].number("deadline_ms")
+        axes.axhline(deadline, color="#b91c1c", lw=1.0, ls="--", label=f"deadline ({deadline:.0f} ms)")
     axes.set(xlabel="time [s]", ylabel="compute time of a step [ms]", ylim=(0.0, None))
     axes.legend(fontsize=8, frameon=False, ncols=4)
     canvas.savefig(path)
