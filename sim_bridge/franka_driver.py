@@ -386,4 +386,4 @@ def _compile(config: FrankaDriverConfig) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the simulated driver; see :func:`vpsto_ros.nodes.lifecycle.run`."""
-    return run(lambda: FrankaDriver("franka_driver"), args)
+    return run(FrankaDriver, "franka_driver", args)

@@ -311,14 +311,12 @@ PROGRAM = textwrap.dedent(
 
     class Node(ManagedNode):
         default_config = Config()
-        def __init__(self):
-            super().__init__("example")
         def configure(self, config):
             self.every(0.02, self.tick)
         def tick(self):
             print("tick", flush=True)
 
-    sys.exit(run(Node))
+    sys.exit(run(Node, "example"))
     """
 )
 
@@ -353,6 +351,15 @@ def test_unknown_arguments_and_unreadable_files_end_with_status_2(tmp_path):
         out, error = process.communicate(timeout=30)
         assert process.returncode == 2
         assert part in out + error and "Traceback" not in out + error
+
+
+def test_help_lists_every_parameter_with_its_range(tmp_path):
+    process = start(tmp_path, "--help")
+    out, _ = process.communicate(timeout=30)
+    assert process.returncode == 0
+    assert "usage: example --ros-args" in out
+    assert "  rate (default " in out
+    assert "float from 1.0 to 50.0 Hz" in out
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])

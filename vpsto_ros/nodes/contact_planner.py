@@ -143,4 +143,4 @@ class ContactPlannerNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the contact planner; see :func:`vpsto_ros.nodes.lifecycle.run`."""
-    return run(lambda: ContactPlannerNode("contact_planner"), args)
+    return run(ContactPlannerNode, "contact_planner", args)

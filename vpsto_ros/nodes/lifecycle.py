@@ -27,7 +27,7 @@ from vpsto_ros.configuration import option
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError, VpstoError
 from vpsto_ros.nodes.conversions import TimeBase
 from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Complaints, Pulse, Report
-from vpsto_ros.nodes.parameters import check_change, declare_parameters, read_parameters
+from vpsto_ros.nodes.parameters import check_change, declare_parameters, help_text, read_parameters
 
 MAX_AHEAD = 0.5
 """A message stamped farther in the future is refused: it would look fresh long after its sender died [s]."""
@@ -385,21 +385,25 @@ class ManagedNode(LifecycleNode):
         return check_change(self.default_config, parameters)
 
 
-def run(node_class: Callable[[], ManagedNode], args: list[str] | None = None) -> int:
-    """Run one node until it is told to stop.
+def run(node_class: type[ManagedNode], name: str, args: list[str] | None = None) -> int:
+    """Run one node until it is told to stop; with ``--help``, print its parameters instead.
 
     Args:
-        node_class: makes the node.
+        node_class: class of the node.
+        name: name of the node, as long as no remap gives it another.
         args: command line with ROS arguments, the process's own when None.
 
     Returns:
         Exit status: 0 after a clean end, 2 after wrong parameters or arguments.
     """
+    if {"-h", "--help"} & set(sys.argv if args is None else args):
+        print(help_text(name, node_class.default_config))
+        return 0
     if not _initialize(args):
         return 2
     node = None
     try:
-        node = _create(node_class)
+        node = _create(node_class, name)
         if node is None:
             return 2
         return _spin(node)
@@ -431,11 +435,11 @@ def _initialize(args: list[str] | None) -> bool:
     return True
 
 
-def _create(node_class: Callable[[], ManagedNode]) -> ManagedNode | None:
+def _create(node_class: type[ManagedNode], name: str) -> ManagedNode | None:
     try:
-        return node_class()
+        return node_class(name)
     except (ConfigurationError, ParameterException) as error:
-        rclpy.logging.get_logger("vpsto_ros").fatal(str(error))
+        rclpy.logging.get_logger(name).fatal(str(error))
         return None
 
 

@@ -378,4 +378,4 @@ class MpcPlannerNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the planner; see :func:`vpsto_ros.nodes.lifecycle.run`."""
-    return run(lambda: MpcPlannerNode("mpc_planner"), args)
+    return run(MpcPlannerNode, "mpc_planner", args)

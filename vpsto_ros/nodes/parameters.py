@@ -91,6 +91,19 @@ def check_change(default: Any, parameters: list[Parameter]) -> SetParametersResu
     return SetParametersResult(successful=True)
 
 
+def help_text(node_name: str, default: Any) -> str:
+    """What ``--help`` prints: every parameter with its default, its meaning and what is allowed."""
+    lines = [
+        f"usage: {node_name} --ros-args [-p name:=value ...] [--params-file FILE] [-r topic:=other ...]",
+        f"example: {node_name} --ros-args --params-file config/push_box.yaml -p use_sim_time:=true",
+        "parameters:",
+    ]
+    for option in _options(default):
+        described = f"{option.field.metadata['description']}; {allowed(option.field)}"
+        lines.append(f"  {option.name} (default {option.default!r})\n      {described}")
+    return "\n".join(lines)
+
+
 def _options(config: Any, prefix: str = "") -> Iterator[_Option]:
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)

@@ -194,4 +194,4 @@ class StateEstimator(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the state estimator; see :func:`vpsto_ros.nodes.lifecycle.run`."""
-    return run(lambda: StateEstimator("state_estimator"), args)
+    return run(StateEstimator, "state_estimator", args)
