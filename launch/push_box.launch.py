@@ -40,6 +40,7 @@ def parameters(file, node, simulated):
 
 
 def nodes(context):
+    """The nodes to start, once the launch arguments are known."""
     file = LaunchConfiguration("params_file").perform(context)
     simulated = LaunchConfiguration("simulation").perform(context).lower() in ("true", "1", "yes")
     names = (*PLANNING, "franka_driver") if simulated else PLANNING
@@ -58,6 +59,7 @@ def nodes(context):
 
 
 def generate_launch_description():
+    """The launch arguments and what they start; what `ros2 launch` looks for."""
     default_file = Path(get_package_share_directory("vpsto_ros")) / "config" / "push_box.yaml"
     return LaunchDescription(
         [
