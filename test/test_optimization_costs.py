@@ -43,7 +43,7 @@ def test_durations_are_costs(batch):
 
 def test_smoothness_is_the_exact_effort(basis, batch):
     weights = np.array([2.0, 0.5])
-    cost = smoothness_cost(basis, batch, V0, VT, weights)
+    cost = smoothness_cost(batch, weights)
     s = np.linspace(0, 1, 20_001)
     for keys, duration, value in zip(batch.key_positions, batch.duration, cost, strict=True):
         spline = CubicSpline(basis.knots, keys, bc_type=((1, V0 * duration), (1, VT * duration)))
@@ -53,12 +53,12 @@ def test_smoothness_is_the_exact_effort(basis, batch):
 def test_smoothness_does_not_depend_on_the_origin(basis, batch):
     moved = synthesize_batch(basis, batch.key_positions + 1e4, V0, VT, LIMITS, 2)
     np.testing.assert_allclose(
-        smoothness_cost(basis, moved, V0, VT), smoothness_cost(basis, batch, V0, VT), rtol=1e-6
+        smoothness_cost(moved), smoothness_cost(batch), rtol=1e-6
     )
 
 
 def test_extrema_are_those_of_the_one_evaluator(basis, batch):
-    lowest, highest = position_extrema(basis, batch, V0, VT)
+    lowest, highest = position_extrema(batch)
     for b, keys in enumerate(batch.key_positions):
         lower, upper = synthesize(basis, keys, V0, VT, LIMITS).extrema(0)
         np.testing.assert_allclose(lowest[b], lower, atol=1e-12)
@@ -67,7 +67,7 @@ def test_extrema_are_those_of_the_one_evaluator(basis, batch):
 
 
 def test_joint_limits_are_exact(basis, batch):
-    cost, valid = joint_limit_cost(basis, batch, V0, VT, LIMITS)
+    cost, valid = joint_limit_cost(batch, LIMITS)
     assert 0 < np.count_nonzero(valid) < len(valid)
     for b, keys in enumerate(batch.key_positions):
         broken = synthesize(basis, keys, V0, VT, LIMITS).violations(LIMITS)
@@ -80,8 +80,8 @@ def test_joint_limit_cost_is_one_plus_the_excess(basis):
     keys = np.zeros((1, 5, 2))
     keys[0, 1:, 0] = 1.5  # overshoots the end position, whose excess alone would be 0.3
     batch = synthesize_batch(basis, keys, np.zeros(2), np.zeros(2), LIMITS, 10)
-    _, highest = position_extrema(basis, batch, np.zeros(2), np.zeros(2))
-    cost, valid = joint_limit_cost(basis, batch, np.zeros(2), np.zeros(2), LIMITS)
+    _, highest = position_extrema(batch)
+    cost, valid = joint_limit_cost(batch, LIMITS)
     assert not valid[0] and cost[0] == pytest.approx(1.0 + highest[0, 0] - 1.2)
 
 

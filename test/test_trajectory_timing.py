@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory import MINIMUM_DURATION, Limits, OptimalBasis, minimal_duration, synthesize_batch
@@ -239,6 +239,20 @@ def test_batch_samples_equal_the_spline(seed):
     np.testing.assert_array_equal(positions.duration, batch.duration)
     assert positions.velocity is None and positions.acceleration is None
     np.testing.assert_array_equal(batch.key_positions, keys)
+    np.testing.assert_array_equal(positions.knot_slopes, batch.knot_slopes)
+
+
+@pytest.mark.parametrize("seed", range(320, 332))
+def test_keys_and_slopes_of_a_batch_are_the_whole_trajectory(seed):
+    basis, keys, start, end, limits = random_problems(seed, batch=10)
+    batch = synthesize_batch(basis, keys, start, end, limits, samples=2)
+    s = np.linspace(0, 1, 57)
+    for b, duration in enumerate(batch.duration):
+        spline = CubicSpline(basis.knots, keys[b], bc_type=((1, duration * start[b]), (1, duration * end[b])))
+        hermite = CubicHermiteSpline(batch.knots, batch.key_positions[b], batch.knot_slopes[b])
+        np.testing.assert_allclose(hermite(s), spline(s), atol=1e-11 * max(1.0, np.abs(keys[b]).max()))
+    too_fast = synthesize_batch(basis, keys, 2.0 * limits.velocity, end, limits, samples=2)
+    assert np.isinf(too_fast.duration).all() and not too_fast.knot_slopes.any()
 
 
 def test_batch_of_one_and_ends():

@@ -1,137 +1,48 @@
-"""Cost terms on batches of trajectories (4.5.2), and the plain problem of VP-STO for any number of joints.
+"""The plain problem of VP-STO for any number of joints, and the cost terms it is made of (4.3).
 
-A term is ranked by its cost; a constraint also says which candidates are valid. Rows of a batch whose
+Rows of a batch whose
 duration is infinite (a boundary velocity beyond its limit) have an infinite cost and are invalid.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.optimization.terms import (
+    CollisionCheck,
+    Term,
+    collision_cost,
+    duration_cost,
+    joint_limit_cost,
+    position_extrema,
+    pushing_progress_cost,
+    smoothness_cost,
+)
 from vpsto_ros.optimization.vpsto import Evaluation
 from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
 from vpsto_ros.trajectory import (
     Limits,
     OptimalBasis,
     Trajectory,
-    TrajectoryBatch,
     minimal_duration,
     synthesize,
     synthesize_batch,
 )
 
-CollisionCheck = Callable[[np.ndarray], np.ndarray]
-Term = Callable[[TrajectoryBatch], tuple[np.ndarray, np.ndarray]]
-
-
-def duration_cost(batch: TrajectoryBatch) -> np.ndarray:
-    """Movement durations [s], shape (B,)."""
-    return batch.duration
-
-
-def smoothness_cost(
-    basis: OptimalBasis,
-    batch: TrajectoryBatch,
-    start_velocity: np.ndarray,
-    end_velocity: np.ndarray,
-    weights: np.ndarray | None = None,
-) -> np.ndarray:
-    """J_s of eq. (4.7), 1/2 int q''(s)^T R q''(s) ds over phase, exact; shape (B,).
-
-    Args:
-        basis: the basis the batch was made with.
-        batch: trajectories.
-        start_velocity: shape (n,), per second.
-        end_velocity: shape (n,), per second.
-        weights: diagonal of R, shape (n,); ones by default.
-    """
-    keys = batch.key_positions
-    slopes = np.stack([start_velocity, end_velocity]) * _finite_duration(batch)[:, None, None]
-    # The effort does not depend on where the origin is; relative to the start it is free of cancellation.
-    w = np.concatenate([keys - keys[:, :1], slopes], axis=1)
-    per_dof = (w * (basis.gramian() @ w)).sum(axis=1)
-    return 0.5 * (per_dof.sum(axis=1) if weights is None else per_dof @ weights)
-
-
-def joint_limit_cost(
-    basis: OptimalBasis,
-    batch: TrajectoryBatch,
-    start_velocity: np.ndarray,
-    end_velocity: np.ndarray,
-    limits: Limits,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Eq. (4.16) at the exact extrema of every joint: 1 + excess for every limit that is exceeded, summed.
-
-    Deviations: the thesis accumulates over evaluation points; and a joint exactly on its limit counts as
-    valid, as it does for :meth:`vpsto_ros.trajectory.Trajectory.violations`.
-
-    Returns:
-        Cost (B,) and validity (B,).
-    """
-    cost = np.zeros(len(batch.duration))
-    if limits.lower is None and limits.upper is None:
-        return cost, np.ones(len(cost), dtype=bool)
-    lowest, highest = position_extrema(basis, batch, start_velocity, end_velocity)
-    if limits.lower is not None:
-        cost += np.where(lowest < limits.lower, 1.0 + limits.lower - lowest, 0.0).sum(axis=1)
-    if limits.upper is not None:
-        cost += np.where(highest > limits.upper, 1.0 + highest - limits.upper, 0.0).sum(axis=1)
-    return cost, cost == 0.0
-
-
-def collision_cost(batch: TrajectoryBatch, in_collision: CollisionCheck) -> tuple[np.ndarray, np.ndarray]:
-    """Number of evaluation points in collision.
-
-    Args:
-        batch: trajectories.
-        in_collision: maps positions (B, K, n) to collisions (B, K) of bool.
-
-    Returns:
-        Cost (B,) and validity (B,).
-
-    Raises:
-        InvalidInputError: the check returned another shape.
-    """
-    hit = np.asarray(in_collision(batch.position))
-    if hit.shape != batch.position.shape[:2] or hit.dtype != bool:
-        raise InvalidInputError(
-            f"the collision check must return bool of shape {batch.position.shape[:2]}, "
-            f"got {hit.dtype} of shape {hit.shape}"
-        )
-    count = hit.sum(axis=1)
-    return count.astype(float), count == 0
-
-
-def pushing_progress_cost(
-    start: np.ndarray, end: np.ndarray, target: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """exp(e_T - e_0) with e the squared distance of the object to its target; valid where e_T < e_0 (4.5.2).
-
-    Args:
-        start: object position before the motion, shape (2,) or (B, 2) [m].
-        end: predicted position after it, shape (B, 2) [m].
-        target: desired position, shape (2,) [m].
-
-    Returns:
-        Cost (B,) and validity (B,).
-    """
-    before = np.square(start - target).sum(axis=-1)
-    after = np.square(end - target).sum(axis=-1)
-    return np.exp(after - before), after < before
-
-
-def position_extrema(
-    basis: OptimalBasis, batch: TrajectoryBatch, start_velocity: np.ndarray, end_velocity: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Exact lowest and highest position of every degree of freedom over the whole motion, shapes (B, n)."""
-    keys = batch.key_positions
-    slopes = np.stack([start_velocity, end_velocity]) * _finite_duration(batch)[:, None, None]
-    knot_slopes = basis.knot_slopes @ np.concatenate([keys - keys[:, :1], slopes], axis=1)
-    return _extrema_kernel(basis.knots, keys, knot_slopes)
+__all__ = [
+    "CollisionCheck",
+    "CostWeights",
+    "JointSpaceProblem",
+    "Term",
+    "collision_cost",
+    "duration_cost",
+    "joint_limit_cost",
+    "position_extrema",
+    "pushing_progress_cost",
+    "smoothness_cost",
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,11 +177,12 @@ class JointSpaceProblem:
 
     def evaluate(self, points: np.ndarray) -> Evaluation:
         """Costs of candidates (B, P, n), for :func:`vpsto_ros.optimization.vpsto.search`."""
-        weights, bounds = self.weights, (self.start_velocity, self.end_velocity)
+        weights = self.weights
         batch = synthesize_batch(
             self.basis,
             self.key_positions(points),
-            *bounds,
+            self.start_velocity,
+            self.end_velocity,
             self.limits,
             self.samples,
             derivatives=bool(self.terms),
@@ -278,8 +190,8 @@ class JointSpaceProblem:
         valid = np.isfinite(batch.duration)
         cost = weights.duration * duration_cost(batch)
         if weights.smoothness:
-            cost = cost + weights.smoothness * smoothness_cost(self.basis, batch, *bounds)
-        constraints = [(weights.joint_limits, joint_limit_cost(self.basis, batch, *bounds, self.limits))]
+            cost = cost + weights.smoothness * smoothness_cost(batch)
+        constraints = [(weights.joint_limits, joint_limit_cost(batch, self.limits))]
         if self.collision is not None:
             constraints.append((weights.collision, collision_cost(batch, self.collision)))
         constraints += [(1.0, term(batch)) for term in self.terms]
@@ -298,34 +210,3 @@ class JointSpaceProblem:
         return synthesize(
             self.basis, keys, self.start_velocity, self.end_velocity, self.limits, start_time=start_time
         )
-
-
-def _finite_duration(batch: TrajectoryBatch) -> np.ndarray:
-    return np.where(np.isfinite(batch.duration), batch.duration, 0.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _extrema_kernel(knots, keys, slopes):
-    """Lowest and highest value (B, n) of cubic Hermite segments through keys with slopes (B, N + 2, n)."""
-    batch, size, dof = keys.shape
-    lowest, highest = keys[:, 0].copy(), keys[:, 0].copy()
-    for b in range(batch):
-        for i in range(size - 1):
-            h = knots[i + 1] - knots[i]
-            for j in range(dof):
-                q, step = keys[b, i, j], keys[b, i + 1, j] - keys[b, i, j]
-                c1, right = h * slopes[b, i, j], h * slopes[b, i + 1, j]
-                c2, c3 = 3.0 * step - 2.0 * c1 - right, c1 + right - 2.0 * step
-                lowest[b, j] = min(lowest[b, j], q + step)
-                highest[b, j] = max(highest[b, j], q + step)
-                # Roots of the slope c1 + 2 c2 u + 3 c3 u^2; division by zero fails the test below.
-                discriminant = c2 * c2 - 3.0 * c1 * c3
-                if discriminant < 0.0:
-                    continue
-                half = -(c2 + np.copysign(np.sqrt(discriminant), c2))
-                for u in (half / (3.0 * c3), c1 / half):
-                    if 0.0 < u < 1.0:
-                        value = q + u * (c1 + u * (c2 + u * c3))
-                        lowest[b, j] = min(lowest[b, j], value)
-                        highest[b, j] = max(highest[b, j], value)
-    return lowest, highest

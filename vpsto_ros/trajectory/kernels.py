@@ -160,14 +160,13 @@ def durations_kernel(knots, knot_slopes, keys, start, end, velocity, acceleratio
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cubic_segments(knots, keys, alpha, beta, duration, cubic):
+def _cubic_segments(knots, keys, slopes, cubic):
     """Coefficients (N + 1, 4, n) in u of every segment."""
     for i in range(cubic.shape[0]):
         h = knots[i + 1] - knots[i]
         for j in range(cubic.shape[2]):
             step = keys[i + 1, j] - keys[i, j]
-            left = h * (alpha[i, j] + duration * beta[i, j])
-            right = h * (alpha[i + 1, j] + duration * beta[i + 1, j])
+            left, right = h * slopes[i, j], h * slopes[i + 1, j]
             cubic[i, 0, j] = keys[i, j]
             cubic[i, 1, j] = left
             cubic[i, 2, j] = 3.0 * step - 2.0 * left - right
@@ -176,9 +175,9 @@ def _cubic_segments(knots, keys, alpha, beta, duration, cubic):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleration, segment, u, derivatives):
-    """Minimal durations (B,) and samples (3, B, K, n) of q, q̇ and q̈, or (1, B, K, n) of q alone."""
+    """Minimal durations (B,), slopes q'(s_i) (B, N + 2, n), samples (3, B, K, n) of q, q̇, q̈ or (1, ...) of q."""
     batch, size, dof = keys.shape
-    duration = np.empty(batch)
+    duration, slopes = np.empty(batch), np.empty((batch, size, dof))
     # One block: the allocator hands separate large ones back to the system, and the page faults then cost
     # more than all the arithmetic.
     out = np.empty((3 if derivatives else 1, batch, u.size, dof))
@@ -189,8 +188,12 @@ def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleratio
         if duration[b] == np.inf:
             out[:, b] = 0.0
             out[0, b] = keys[b, 0]
+            slopes[b] = 0.0
             continue
-        _cubic_segments(knots, keys[b], alpha, beta, duration[b], cubic)
+        for i in range(size):
+            for j in range(dof):
+                slopes[b, i, j] = alpha[i, j] + duration[b] * beta[i, j]
+        _cubic_segments(knots, keys[b], slopes[b], cubic)
         for k in range(u.size):
             i, x = segment[k], u[k]
             rate = 1.0 / ((knots[i + 1] - knots[i]) * duration[b])
@@ -200,4 +203,4 @@ def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleratio
                 if derivatives:
                     out[1, b, k, j] = rate * (c1 + x * (2.0 * c2 + x * 3.0 * c3))
                     out[2, b, k, j] = rate * rate * (2.0 * c2 + x * 6.0 * c3)
-    return duration, out
+    return duration, slopes, out

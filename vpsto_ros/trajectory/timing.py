@@ -72,6 +72,10 @@ class TrajectoryBatch:
         velocity: (B, K, n) time derivatives, or None if not asked for.
         acceleration: (B, K, n), or None if not asked for.
         key_positions: (B, N + 2, n) what the trajectories pass through.
+        knots: (N + 2,) phases of the key positions, from 0 to 1.
+        knot_slopes: (B, N + 2, n) q'(s_i) with respect to phase, zero in a row of infinite duration. Between
+            two knots q is the cubic with these values and slopes at its ends, so that with the duration the
+            whole trajectory is known, not just its samples.
     """
 
     duration: NDArray[np.float64]
@@ -79,6 +83,8 @@ class TrajectoryBatch:
     velocity: NDArray[np.float64] | None
     acceleration: NDArray[np.float64] | None
     key_positions: NDArray[np.float64]
+    knots: NDArray[np.float64]
+    knot_slopes: NDArray[np.float64]
 
 
 def minimal_duration(
@@ -150,7 +156,7 @@ def synthesize_batch(
     """
     keys, start, end = _prepare(basis, key_positions, start_velocity, end_velocity, limits)
     segment, u = _sample_grid(basis, samples)
-    duration, samples_of = synthesis_kernel(
+    duration, slopes, samples_of = synthesis_kernel(
         basis.knots,
         basis.knot_slopes,
         keys,
@@ -162,9 +168,8 @@ def synthesize_batch(
         u,
         derivatives,
     )
-    if not derivatives:
-        return TrajectoryBatch(duration, samples_of[0], None, None, keys)
-    return TrajectoryBatch(duration, samples_of[0], samples_of[1], samples_of[2], keys)
+    velocity, acceleration = (samples_of[1], samples_of[2]) if derivatives else (None, None)
+    return TrajectoryBatch(duration, samples_of[0], velocity, acceleration, keys, basis.knots, slopes)
 
 
 @functools.lru_cache(maxsize=64)

@@ -1,0 +1,144 @@
+"""Cost terms on batches of trajectories (4.5.2).
+
+A term is ranked by its cost; a constraint also says which candidates are valid.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.trajectory import Limits, TrajectoryBatch
+
+CollisionCheck = Callable[[np.ndarray], np.ndarray]
+Term = Callable[[TrajectoryBatch], tuple[np.ndarray, np.ndarray]]
+
+
+def duration_cost(batch: TrajectoryBatch) -> np.ndarray:
+    """Movement durations [s], shape (B,)."""
+    return batch.duration
+
+
+def smoothness_cost(batch: TrajectoryBatch, weights: np.ndarray | None = None) -> np.ndarray:
+    """J_s of eq. (4.7), 1/2 int q''(s)^T R q''(s) ds over phase, exact; shape (B,).
+
+    Args:
+        batch: trajectories.
+        weights: diagonal of R, shape (n,); ones by default.
+    """
+    dof = batch.key_positions.shape[2]
+    diagonal = np.ones(dof) if weights is None else np.asarray(weights, dtype=float)
+    if diagonal.shape != (dof,):
+        raise InvalidInputError(f"weights must have shape ({dof},), got {diagonal.shape}")
+    return smoothness_kernel(batch.knots, batch.key_positions, batch.knot_slopes, diagonal)
+
+
+def joint_limit_cost(batch: TrajectoryBatch, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+    """Eq. (4.16) at the exact extrema of every joint: 1 + excess for every limit that is exceeded, summed.
+
+    Deviations: the thesis accumulates over evaluation points; and a joint exactly on its limit counts as
+    valid, as it does for :meth:`vpsto_ros.trajectory.Trajectory.violations`.
+
+    Returns:
+        Cost (B,) and validity (B,).
+    """
+    cost = np.zeros(len(batch.duration))
+    if limits.lower is None and limits.upper is None:
+        return cost, np.ones(len(cost), dtype=bool)
+    lowest, highest = position_extrema(batch)
+    if limits.lower is not None:
+        cost += np.where(lowest < limits.lower, 1.0 + limits.lower - lowest, 0.0).sum(axis=1)
+    if limits.upper is not None:
+        cost += np.where(highest > limits.upper, 1.0 + highest - limits.upper, 0.0).sum(axis=1)
+    return cost, cost == 0.0
+
+
+def collision_cost(batch: TrajectoryBatch, in_collision: CollisionCheck) -> tuple[np.ndarray, np.ndarray]:
+    """Number of evaluation points in collision.
+
+    Args:
+        batch: trajectories.
+        in_collision: maps positions (B, K, n) to collisions (B, K) of bool.
+
+    Returns:
+        Cost (B,) and validity (B,).
+
+    Raises:
+        InvalidInputError: the check returned another shape.
+    """
+    hit = np.asarray(in_collision(batch.position))
+    if hit.shape != batch.position.shape[:2] or hit.dtype != bool:
+        raise InvalidInputError(
+            f"the collision check must return bool of shape {batch.position.shape[:2]}, "
+            f"got {hit.dtype} of shape {hit.shape}"
+        )
+    count = hit.sum(axis=1)
+    return count.astype(float), count == 0
+
+
+def pushing_progress_cost(
+    start: np.ndarray, end: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """exp(e_T - e_0) with e the squared distance of the object to its target; valid where e_T < e_0 (4.5.2).
+
+    Args:
+        start: object position before the motion, shape (2,) or (B, 2) [m].
+        end: predicted position after it, shape (B, 2) [m].
+        target: desired position, shape (2,) [m].
+
+    Returns:
+        Cost (B,) and validity (B,).
+    """
+    before = np.square(start - target).sum(axis=-1)
+    after = np.square(end - target).sum(axis=-1)
+    return np.exp(after - before), after < before
+
+
+def position_extrema(batch: TrajectoryBatch) -> tuple[np.ndarray, np.ndarray]:
+    """Exact lowest and highest position of every degree of freedom over the whole motion, shapes (B, n)."""
+    return extrema_kernel(batch.knots, batch.key_positions, batch.knot_slopes)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def extrema_kernel(knots, keys, slopes):
+    """Lowest and highest value (B, n) of cubic Hermite segments through keys with slopes (B, N + 2, n)."""
+    batch, size, dof = keys.shape
+    lowest, highest = keys[:, 0].copy(), keys[:, 0].copy()
+    for b in range(batch):
+        for i in range(size - 1):
+            h = knots[i + 1] - knots[i]
+            for j in range(dof):
+                q, step = keys[b, i, j], keys[b, i + 1, j] - keys[b, i, j]
+                c1, right = h * slopes[b, i, j], h * slopes[b, i + 1, j]
+                c2, c3 = 3.0 * step - 2.0 * c1 - right, c1 + right - 2.0 * step
+                lowest[b, j] = min(lowest[b, j], q + step)
+                highest[b, j] = max(highest[b, j], q + step)
+                # Roots of the slope c1 + 2 c2 u + 3 c3 u^2; division by zero fails the test below.
+                discriminant = c2 * c2 - 3.0 * c1 * c3
+                if discriminant < 0.0:
+                    continue
+                half = -(c2 + np.copysign(np.sqrt(discriminant), c2))
+                for u in (half / (3.0 * c3), c1 / half):
+                    if 0.0 < u < 1.0:
+                        value = q + u * (c1 + u * (c2 + u * c3))
+                        lowest[b, j] = min(lowest[b, j], value)
+                        highest[b, j] = max(highest[b, j], value)
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def smoothness_kernel(knots, keys, slopes, weights):
+    """Half the weighted effort (B,) of cubic Hermite segments through keys with slopes (B, N + 2, n)."""
+    batch, size, dof = keys.shape
+    effort = np.zeros(batch)
+    for b in range(batch):
+        for i in range(size - 1):
+            h = knots[i + 1] - knots[i]
+            for j in range(dof):
+                step = keys[b, i + 1, j] - keys[b, i, j]
+                left, right = h * slopes[b, i, j], h * slopes[b, i + 1, j]
+                c2, c3 = 3.0 * step - 2.0 * left - right, left + right - 2.0 * step
+                # 1/2 int (2 c2 + 6 c3 u)^2 du / h^3
+                effort[b] += weights[j] * (2.0 * c2 * c2 + 6.0 * c3 * (c2 + c3)) / h**3
+    return effort
