@@ -1,6 +1,7 @@
 """The smoothness prior against an independent spline, and the algebra of Gaussians."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy.optimize import minimize
 
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.priors.contact import contact_factor
-from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
+from vpsto_ros.priors.smoothness import GaussianPrior, SeparablePrior, smoothness_prior
 from vpsto_ros.trajectory import OptimalBasis
 
 START, END = np.array([0.2, -1.0]), np.array([1.0, 0.5])
@@ -168,6 +169,50 @@ def test_a_contact_factor_is_a_gaussian_on_its_point():
     np.testing.assert_allclose(information, precision @ [0, 0, 0, 0, 1.0, 2.0])
 
 
+def dense(prior):
+    """The same Gaussian without its structure."""
+    return GaussianPrior(prior.mean, prior.precision, prior.dof)
+
+
+@pytest.mark.parametrize("end", [END, None])
+@pytest.mark.parametrize("n_via", [1, 3, 7])
+def test_the_structured_form_equals_the_dense_one(n_via, end):
+    prior = make(n_via, end, weights=np.array([0.3, 2.0]), spread=0.2)
+    plain, rng = dense(prior), np.random.default_rng(0)
+    latent = rng.standard_normal((6, prior.dimension))
+    np.testing.assert_allclose(prior.to_points(latent), plain.to_points(latent), atol=1e-12)
+    points = rng.standard_normal((6, prior.n_points, 2))
+    np.testing.assert_allclose(prior.to_latent(points), plain.to_latent(points), atol=1e-9)
+    np.testing.assert_allclose(prior.covariance, plain.covariance, atol=1e-12)
+    np.testing.assert_allclose(prior.cholesky, plain.cholesky, atol=1e-12)
+    samples = prior.sample(np.random.default_rng(1), 5)
+    np.testing.assert_allclose(samples, plain.sample(np.random.default_rng(1), 5), atol=1e-12)
+    spread = np.array([[0.02, 0.01], [0.01, 0.03]])
+    factor = contact_factor(prior.n_points, 2, 0, np.array([0.4, 0.1]), spread)
+    product, expected = prior.times(*factor), plain.times(*factor)
+    np.testing.assert_array_equal(product.mean, expected.mean)
+    np.testing.assert_array_equal(product.precision, expected.precision)
+    np.testing.assert_allclose(prior.times(plain).mean, prior.mean, atol=1e-12)
+
+
+def peak_memory(n):
+    """Bytes it takes to make a prior over 4 points of n degrees of freedom, to draw from it and to go back."""
+    zeros, ones = np.zeros(n), np.ones(n)
+    tracemalloc.start()
+    prior = smoothness_prior(OptimalBasis.uniform(4), zeros, zeros, ones, zeros, 1.0, spread=0.1)
+    prior.to_latent(prior.sample(np.random.default_rng(0), 8))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+def test_the_cost_grows_linearly_with_the_degrees_of_freedom():
+    peak_memory(3)
+    few, many = peak_memory(1000), peak_memory(4000)
+    assert many < 4.5 * few
+    assert many < 4000 * 4 * 8 * 40, "a dense matrix would take 4000 * 4 * 8 * 16000 bytes"
+
+
 def test_many_points_stay_well_conditioned():
     prior = smoothness_prior(
         OptimalBasis.uniform(20), np.zeros(7), np.zeros(7), np.ones(7), np.zeros(7), 1.0, spread=0.3
@@ -188,6 +233,10 @@ def test_errors_name_what_is_wrong():
         GaussianPrior(np.zeros(5), np.eye(5), 2)
     with pytest.raises(InvalidInputError, match="not positive definite"):
         _ = GaussianPrior(np.zeros(2), -np.eye(2), 2).cholesky
+    with pytest.raises(InvalidInputError, match="not positive definite"):
+        SeparablePrior(np.zeros((1, 2)), -np.eye(1), np.ones(2))
+    with pytest.raises(InvalidInputError, match="2 positive scales"):
+        SeparablePrior(np.zeros((1, 2)), np.eye(1), np.array([1.0, 0.0]))
     with pytest.raises(InvalidInputError, match="4 variables"):
         make(2).times(np.eye(3), np.zeros(3))
     with pytest.raises(InvalidInputError, match="information vector"):

@@ -175,7 +175,10 @@ def _cubic_segments(knots, keys, slopes, cubic):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleration, segment, u, derivatives):
-    """Minimal durations (B,), slopes q'(s_i) (B, N + 2, n), samples (3, B, K, n) of q, q̇, q̈ or (1, ...) of q."""
+    """Minimal durations (B,), slopes q'(s_i) (B, N + 2, n) and samples (3, B, K, n) of q, q̇ and q̈.
+
+    Without derivatives the samples are (1, B, K, n) of q alone.
+    """
     batch, size, dof = keys.shape
     duration, slopes = np.empty(batch), np.empty((batch, size, dof))
     # One block: the allocator hands separate large ones back to the system, and the page faults then cost
