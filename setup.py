@@ -30,14 +30,16 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]>=7.1,<8", "ros-jazzy-common-interfaces>=5.3,<6"],
         "sim": [
             "mujoco>=4,<5",
+            "joblib>=1.4",
             "matplotlib>=3.8",
             "tqdm>=4.60",
             "rosbags>=0.10.11",
             "viser>=1.0",
             "imageio[ffmpeg]>=2.30",
         ],
+        "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "pycma": ["cma>=4"],
-        "test": ["pytest>=7", "pytest-xdist>=3.5", "hypothesis>=6"],
+        "test": ["pytest>=7", "pytest-xdist>=3.5", "hypothesis>=6", "distributed>=2024.1"],
         "lint": ["ruff>=0.12", "mypy>=1.11"],
     },
     entry_points={

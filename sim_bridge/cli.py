@@ -17,6 +17,7 @@ examples:
   vpsto demo push_box --viewer                the same with a live 3-D view in the browser
   vpsto demo push_box --real-time-factor 0.5  on a slow machine: simulated time runs at half speed
   vpsto experiment push_box --runs 20         20 random boxes, in lock-step and without ROS
+  vpsto experiment push_box --resume          go on with an experiment that was stopped
   vpsto bench --json bench.json               how long search, replanning and simulation take here
 
 exit status: 0 success, 1 the run failed, 2 the command was not understood
@@ -27,6 +28,13 @@ EXPERIMENTS = {
     "push_box": "sim_bridge.experiments.push_box",
     "push_t": "sim_bridge.experiments.push_t",
     "planning_space": "sim_bridge.experiments.planning_space",
+    "clutter_2d": "sim_bridge.experiments.clutter_2d",
+    "clutter_2d_mpc": "sim_bridge.experiments.clutter_2d_mpc",
+    "via_points": "sim_bridge.experiments.via_points",
+    "cholesky": "sim_bridge.experiments.cholesky",
+    "key_timing": "sim_bridge.experiments.key_timing",
+    "reach_clutter": "sim_bridge.experiments.reach_clutter",
+    "search": "sim_bridge.experiments.search_choices",
 }
 
 
@@ -44,6 +52,11 @@ def positive(text: str) -> float:
 def count(text: str) -> int:
     """A whole number of at least one, for argparse."""
     return _whole(text, minimum=1)
+
+
+def jobs(text: str) -> int:
+    """A number of processes, 0 for every core, for argparse."""
+    return _whole(text, minimum=0)
 
 
 def seed(text: str) -> int:
@@ -146,12 +159,24 @@ def _experiment_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of the first episode (default 0)")
     out = f"output/experiment_{name}"
     parser.add_argument("--out", default=out, metavar="DIR", type=folder, help=f"results (default {out})")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--jobs", type=jobs, metavar="N", help="parallel processes; 0, the default, uses every core"
+    )
+    place.add_argument(
+        "--scheduler", metavar="ADDRESS", help="run on this Dask scheduler, for example tcp://10.0.0.1:8786"
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="keep the finished runs of an interrupted call in --out"
+    )
 
 
 def _load(module: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
+        if error.name == module:
+            raise VpstoError(f"this installation has no {module}") from error
         if (error.name or "").startswith(("sim_bridge", "vpsto_ros")):
             raise
         remedy = "make install, or pip install 'vpsto_ros[ros,sim]'"

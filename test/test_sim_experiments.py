@@ -12,7 +12,7 @@ from sim_bridge.experiments import push_box, push_t
 from sim_bridge.experiments.pushing_experiment import Targets, results_table, run_variant, summarise
 from sim_bridge.experiments.pushing_loop import Recording
 from sim_bridge.experiments.pushing_trials import KNOCK_MARGIN, Trial, run_trial
-from sim_bridge.experiments.runs import markdown_table, quantile, run_trials, success_interval, write_summary
+from sim_bridge.experiments.runs import markdown_table, quantile, success_interval, write_summary
 from sim_bridge.scene import ObjectPlant
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.planning.workspace import Workspace
@@ -169,17 +169,6 @@ def test_success_intervals_are_wilsons(successes, runs, low, high):
 def test_quantiles_leave_out_what_is_missing():
     assert quantile([3.0, None, 1.0, np.nan, 2.0, np.inf], 0.5) == 2.0
     assert quantile([None], 0.5) is None
-
-
-def random_sum(seed):
-    """A trial for the test of parallel runs, at module level so that it can be sent to another process."""
-    return seed, float(np.random.default_rng(seed).standard_normal(100).sum())
-
-
-def test_parallel_runs_give_the_same_results_in_the_same_order():
-    alone = run_trials(random_sum, range(5), 1, "alone")
-    assert run_trials(random_sum, range(5), 2, "together") == alone
-    assert [seed for seed, _ in alone] == list(range(5))
 
 
 def test_tables_are_aligned_and_read_back():

@@ -8,13 +8,14 @@ height all along.
 """
 
 import argparse
+import functools
 import pathlib
 import time
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.runs import markdown_table, write_summary
+from sim_bridge.experiments.runs import Execution, markdown_table, run_trials, write_summary
 from vpsto_ros.exceptions import InfeasibleError
 from vpsto_ros.planning.table_path import TablePath
 from vpsto_ros.planning.workspace import Workspace
@@ -41,9 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and print the table; 0 when the plane keeps the height about as often as the best space."""
-    rng = np.random.default_rng(arguments.seed)
-    comparison = Comparison()
-    moves = [comparison.move(comparison.random_ends(rng), rng) for _ in range(arguments.runs)]
+    seeds = range(arguments.seed, arguments.seed + arguments.runs)
+    moves = run_trials(random_move, seeds, Execution.from_arguments(arguments), "planning_space")
     rows = {name: summarise([move[name] for move in moves]) for name in SPACES}
     folder = pathlib.Path(arguments.out)
     write_summary(
@@ -68,6 +68,19 @@ def run(arguments: argparse.Namespace) -> int:
     good = rows["plane"]["within"] >= max(0.95, rows["joints"]["within"], rows["projected"]["within"] - 0.05)
     print("verdict: " + ("passed" if good else "FAILED") + ": planning in the plane keeps the tool's height")
     return 0 if good else 1
+
+
+def random_move(seed: int) -> dict[str, tuple[NDArray, float]]:
+    """One random move planned in the three spaces; see :meth:`Comparison.move`."""
+    rng = np.random.default_rng([seed, 3])
+    comparison = shared_comparison()
+    return comparison.move(comparison.random_ends(rng), rng)
+
+
+@functools.cache
+def shared_comparison() -> "Comparison":
+    """One for all moves of a process: its maps take longer to build than a move to plan."""
+    return Comparison()
 
 
 def summarise(results: list[tuple[NDArray, float]]) -> dict[str, float]:
@@ -116,9 +129,9 @@ class Comparison:
             prior = smoothness_prior(self.basis, ends[0], still, ends[1], still, 2.0, spread=spread)
             points = prior.sample(rng, CANDIDATES)
             heights = self._heights(name, ends, points)
-            begin = time.perf_counter()
+            begin = time.thread_time()
             self._candidates(name, ends, points)
-            results[name] = heights, time.perf_counter() - begin
+            results[name] = heights, time.thread_time() - begin
         return results
 
     def _candidates(self, name: str, ends: NDArray, points: NDArray) -> None:
@@ -161,9 +174,8 @@ class Comparison:
             try:
                 joints = self.path.joints(motion, self.map.joints(ends[:1])[0], np.zeros(7))
             except InfeasibleError:
-                errors.append(
-                    np.inf
-                )  # the arm would leave the table or its limits: not a candidate that works
+                # The arm would leave the table or its limits: not a candidate that works.
+                errors.append(np.inf)
                 continue
             times = np.linspace(joints.start_time, joints.end_time, SAMPLES)
             errors.append(np.abs(forward_kinematics_batch(joints(times))[:, 2] - self.map.height).max())

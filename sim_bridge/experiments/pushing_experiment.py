@@ -2,17 +2,22 @@
 
 import argparse
 import dataclasses
-import os
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from sim_bridge.cli import count
 from sim_bridge.experiments.pushing_loop import PushingLoop
 from sim_bridge.experiments.pushing_trials import Trial, TrialResult, run_trial, simulate, start_joints
-from sim_bridge.experiments.runs import markdown_table, quantile, run_trials, success_interval, write_summary
+from sim_bridge.experiments.runs import (
+    Execution,
+    markdown_table,
+    quantile,
+    run_trials,
+    success_interval,
+    write_summary,
+)
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import ConfigurationError
@@ -88,13 +93,6 @@ class PushingExperiment:
         """Options of this experiment."""
         names = [variant.name for variant in self.variants]
         parser.add_argument(
-            "--jobs",
-            type=count,
-            default=os.cpu_count(),
-            metavar="N",
-            help="parallel processes (default: all cores)",
-        )
-        parser.add_argument(
             "--only",
             action="append",
             metavar="VARIANT",
@@ -106,10 +104,12 @@ class PushingExperiment:
         folder = pathlib.Path(arguments.out)
         folder.mkdir(parents=True, exist_ok=True)
         trials = [self.random_trial(seed) for seed in range(arguments.seed, arguments.seed + arguments.runs)]
-        results = {}
-        for variant in self._chosen(arguments.only):
-            tasks = [(variant, trial) for trial in trials]
-            results[variant.name] = run_trials(run_variant, tasks, arguments.jobs, variant.title)
+        variants = self._chosen(arguments.only)
+        tasks = [(variant, trial) for variant in variants for trial in trials]
+        runs = run_trials(run_variant, tasks, Execution.from_arguments(arguments), self.name)
+        results = {
+            variant.name: runs[k * len(trials) : (k + 1) * len(trials)] for k, variant in enumerate(variants)
+        }
         return self._report(folder, trials, results)
 
     def _chosen(self, names: Sequence[str] | None) -> list[Variant]:

@@ -1,0 +1,182 @@
+"""Where trials run: in this process, in processes of this machine (joblib), or on a Dask cluster.
+
+Each of the three is a generator of ``(index, Outcome)`` in the order in which runs finish. A worker does one
+trial at a time with one BLAS thread, so that the place changes no result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import pickle
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Generator, Sequence
+from typing import Any
+
+from vpsto_ros import __version__
+from vpsto_ros.exceptions import ConfigurationError, VpstoError
+
+CONNECT_SECONDS = 5.0
+"""A scheduler that has not answered after this time is not there."""
+WORKER_SECONDS = 30.0
+"""A scheduler may wait so long for its first worker."""
+
+
+class TrialError(VpstoError):
+    """A run of an experiment failed; the message names it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What came out of a trial: a result, or an error in words (with the traceback if nobody expected it)."""
+
+    result: Any = None
+    error: str | None = None
+
+
+def attempt(trial: Callable[[Any], Any], task: Any) -> Outcome:
+    """Run a trial and turn an exception into words, which travel between processes and machines."""
+    try:
+        return Outcome(trial(task))
+    except VpstoError as error:
+        return Outcome(error=f"{type(error).__name__}: {error}")
+    except Exception as error:
+        return Outcome(error=f"{type(error).__name__}: {error}\n{traceback.format_exc()}")
+
+
+def in_this_process(
+    trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
+) -> Generator[tuple[int, Outcome]]:
+    """One after the other; each gets a copy of its task, as a worker would."""
+    for index, task in tasks:
+        yield index, attempt(trial, pickle.loads(pickle.dumps(task)))
+
+
+def in_processes(
+    trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]], jobs: int
+) -> Generator[tuple[int, Outcome]]:
+    """In `jobs` processes of this machine.
+
+    Raises:
+        TrialError: when a worker process dies.
+    """
+    import joblib
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+
+    calls = (joblib.delayed(_in_worker)(trial, index, task) for index, task in tasks)
+    with joblib.parallel_config("loky", inner_max_num_threads=1):
+        # Arrays are sent, not mapped from a shared file: a trial may write into its task.
+        parallel = joblib.Parallel(
+            n_jobs=jobs, batch_size=1, max_nbytes=None, return_as="generator_unordered"
+        )
+        outcomes = parallel(calls)
+        try:
+            yield from outcomes
+        except BrokenProcessPool as error:
+            raise TrialError(f"a worker process died (killed, or out of memory?): {error}") from error
+        finally:
+            outcomes.close()
+
+
+def _in_worker(trial: Callable[[Any], Any], index: int, task: Any) -> tuple[int, Outcome]:
+    with contextlib.suppress(ValueError):  # not the main thread
+        # Ctrl-C reaches the whole process group; the parent decides what to do about it.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return index, attempt(trial, task)
+
+
+def on_cluster(
+    trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]], scheduler: str
+) -> Generator[tuple[int, Outcome]]:
+    """On the workers of a Dask scheduler; what a dead worker was doing is done again by another.
+
+    Args:
+        trial: as of :func:`sim_bridge.experiments.runs.run_trials`.
+        tasks: with their indices.
+        scheduler: address such as ``tcp://10.0.0.1:8786``.
+
+    Raises:
+        ConfigurationError: when Dask is missing, nothing answers at the address, there are no workers, or
+            they have another version of this package.
+        TrialError: when a task has killed several workers, or the scheduler is lost.
+    """
+    client = _connect(scheduler)
+    try:
+        _check_workers(client, scheduler)
+        yield from _collect(client, trial, tasks)
+    finally:
+        with contextlib.suppress(OSError, TimeoutError):
+            client.close()
+
+
+def _connect(scheduler: str) -> Any:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigurationError(
+            "--scheduler needs Dask; install it: pip install 'vpsto_ros[cluster]'"
+        ) from error
+    try:
+        return Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ConfigurationError(
+            f"no Dask scheduler answers at {scheduler} within {CONNECT_SECONDS:g} s; "
+            "start one with `dask scheduler` and give the address it prints"
+        ) from error
+
+
+def _check_workers(client: Any, scheduler: str) -> None:
+    """Refuse a cluster without workers, or whose workers would compute something else."""
+    try:
+        client.wait_for_workers(1, timeout=WORKER_SECONDS)
+    except TimeoutError as error:
+        raise ConfigurationError(
+            f"the scheduler at {scheduler} has no workers; start some: dask worker {scheduler}"
+        ) from error
+    try:
+        versions = client.run(package_version)
+    except Exception as error:  # whatever the worker could not import
+        raise ConfigurationError(f"the workers of {scheduler} cannot load vpsto_ros: {error}") from error
+    for worker, version in versions.items():
+        if version != __version__:
+            raise ConfigurationError(f"worker {worker} has vpsto_ros {version}, here it is {__version__}")
+
+
+def package_version() -> str:
+    """The version of this package, asked of a worker."""
+    return __version__
+
+
+def _collect(
+    client: Any, trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
+) -> Generator[tuple[int, Outcome]]:
+    from distributed import as_completed
+
+    indices = {}
+    for index, task in tasks:
+        # Impure: the scheduler must not take an older result of the same call for this one.
+        indices[client.submit(_alone, trial, task, pure=False)] = index
+    try:
+        for future in as_completed(list(indices)):
+            if future.status != "finished":
+                raise TrialError(_cluster_failure(future, indices[future]))
+            yield indices[future], future.result()
+    finally:
+        with contextlib.suppress(Exception):  # the scheduler may be what was lost
+            client.cancel(list(indices))
+
+
+def _cluster_failure(future: Any, index: int) -> str:
+    reason = future.exception() if future.status == "error" else "the scheduler is gone"
+    return f"task {index} was lost on the cluster: {reason}"
+
+
+_ONE_AT_A_TIME = threading.Lock()
+
+
+def _alone(trial: Callable[[Any], Any], task: Any) -> Outcome:
+    """A trial in a worker that may have several threads: trials take turns there, they share a process."""
+    with _ONE_AT_A_TIME:
+        return attempt(trial, task)
