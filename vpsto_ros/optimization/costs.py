@@ -26,6 +26,7 @@ from vpsto_ros.trajectory import (
     Limits,
     OptimalBasis,
     Trajectory,
+    TrajectoryBatch,
     minimal_duration,
     synthesize,
     synthesize_batch,
@@ -177,7 +178,6 @@ class JointSpaceProblem:
 
     def evaluate(self, points: np.ndarray) -> Evaluation:
         """Costs of candidates (B, P, n), for :func:`vpsto_ros.optimization.vpsto.search`."""
-        weights = self.weights
         batch = synthesize_batch(
             self.basis,
             self.key_positions(points),
@@ -187,6 +187,11 @@ class JointSpaceProblem:
             self.samples,
             derivatives=bool(self.terms),
         )
+        return self.assess(batch)
+
+    def assess(self, batch: TrajectoryBatch) -> Evaluation:
+        """Costs of trajectories that are there already, also of ones that no candidate stands for."""
+        weights = self.weights
         valid = np.isfinite(batch.duration)
         cost = weights.duration * duration_cost(batch)
         if weights.smoothness:
