@@ -62,7 +62,8 @@ def test_defaults_of_the_demo():
 def test_experiments_take_the_common_options(name):
     if importlib.util.find_spec(cli.EXPERIMENTS[name]) is None:
         pytest.skip("not there yet")
-    arguments = ["experiment", name, "--runs", "3", "--seed", "5", "--out", "there", "--jobs", "2", "--resume"]
+    common = ["--runs", "3", "--seed", "5", "--out", "there", "--jobs", "2", "--resume"]
+    arguments = ["experiment", name, *common]
     parsed = cli.build_parser(arguments).parse_args(arguments)
     assert (parsed.runs, parsed.seed, parsed.out) == (3, 5, "there")
     assert (parsed.jobs, parsed.scheduler, parsed.resume) == (2, None, True)

@@ -122,7 +122,7 @@ def _connect(scheduler: str) -> Any:
         return Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigurationError(
-            f"no Dask scheduler answers at {scheduler} within {CONNECT_SECONDS:g} s; "
+            f"no Dask scheduler answers at {scheduler} within {CONNECT_SECONDS:g} s ({error}); "
             "start one with `dask scheduler` and give the address it prints"
         ) from error
 
@@ -159,7 +159,7 @@ def _collect(
         # Impure: the scheduler must not take an older result of the same call for this one.
         indices[client.submit(_alone, trial, task, pure=False)] = index
     try:
-        for future in as_completed(list(indices)):
+        for future in as_completed(list(indices), loop=client.loop):
             if future.status != "finished":
                 raise TrialError(_cluster_failure(future, indices[future]))
             yield indices[future], future.result()
