@@ -1,0 +1,351 @@
+"""Online VP-STO to a goal in joint space, among obstacles that may move (4.4, Algorithm 1).
+
+:class:`OnlineJointSpaceProblem` poses one planning step for any number of joints; obstacles are cost terms.
+:class:`JointSpaceMpc` plans step after step from the motion that is being executed and decides what to do
+when the search finds nothing.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vpsto_ros.configuration import option, validate
+from vpsto_ros.exceptions import InvalidInputError, VpstoError
+from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem, Term
+from vpsto_ros.optimization.vpsto import Evaluation, SearchResult, VpstoConfig
+from vpsto_ros.planning.mpc import OnlineConfig, OnlineVpsto
+from vpsto_ros.planning.table_path import extended, resting
+from vpsto_ros.priors.smoothness import GaussianPrior
+from vpsto_ros.trajectory import (
+    MINIMUM_DURATION,
+    Limits,
+    OptimalBasis,
+    Trajectory,
+    TrajectoryBatch,
+    braking_trajectory,
+    synthesize,
+    synthesize_batch,
+)
+
+AT_GOAL = 1e-9
+"""Distance between the end of a motion and the goal that still counts as arriving."""
+
+MOST_ESCAPES = 8
+"""How many ways out are looked at more closely."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointSpaceMpcConfig:
+    """Options of :class:`JointSpaceMpc`.
+
+    Raises:
+        ConfigurationError: a value is out of range.
+    """
+
+    online: OnlineConfig = dataclasses.field(
+        default_factory=lambda: OnlineConfig(
+            n_via=5, via_rate=1.0, stop_duration=0.5, search=VpstoConfig(population=25, iterations=10)
+        )
+    )
+    weights: CostWeights = dataclasses.field(default_factory=CostWeights)
+    samples: int = option(50, "evaluation points per candidate", minimum=2, maximum=10_000)
+    spread: float = option(
+        0.15, "standard deviation of via-points when exploring, in the unit of the joints", minimum=1e-9
+    )
+    lookahead: float = option(
+        1.5, "how long a motion must be clear to be followed while no valid plan is known", unit="s",
+        minimum=0.1, maximum=60.0,
+    )  # fmt: skip
+    escapes: int = option(
+        32, "random short motions tried when going on and braking would both collide", minimum=1, maximum=1000
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+class OnlineJointSpaceProblem:
+    """From a state in motion to rest at a goal: an ``OnlineProblem`` for n joints.
+
+    Search points are the via-points; a :class:`JointSpaceProblem` per number of via-points does the rest.
+    """
+
+    def __init__(
+        self,
+        limits: Limits,
+        *,
+        position: NDArray,
+        velocity: NDArray,
+        start_time: float,
+        goal: NDArray,
+        terms: tuple[Term, ...] = (),
+        config: JointSpaceMpcConfig,
+    ) -> None:
+        """Pose the problem.
+
+        Args:
+            limits: velocity, acceleration and position limits of n joints.
+            position: position when the plan takes over, shape (n,) [rad or m].
+            velocity: velocity at that time, shape (n,) [1/s].
+            start_time: that time [s].
+            goal: where to come to rest, shape (n,).
+            terms: obstacles and further costs. Moving obstacles count time from ``start_time``, as the
+                trajectories of a batch do.
+            config: weights, evaluation points and the width of the prior.
+        """
+        self.limits, self.position, self.velocity = limits, position, velocity
+        self.start_time, self.goal, self.terms, self.config = start_time, goal, terms, config
+        self._plain: dict[int, JointSpaceProblem] = {}
+
+    def plain(self, n_via: int) -> JointSpaceProblem:
+        """The problem of 4.3 with a given number of via-points."""
+        if n_via not in self._plain:
+            self._plain[n_via] = JointSpaceProblem(
+                OptimalBasis.uniform(n_via), self.limits, self.position, self.goal,
+                start_velocity=self.velocity, terms=self.terms,
+                weights=self.config.weights, samples=self.config.samples,
+            )  # fmt: skip
+        return self._plain[n_via]
+
+    def evaluate(self, points: NDArray) -> Evaluation:
+        """Cost and validity of candidates (B, P, n), for any P."""
+        return self.plain(points.shape[1]).evaluate(points)
+
+    def assess(self, trajectory: Trajectory) -> tuple[float, bool]:
+        """Cost and validity, measured as those of the candidates, of a motion that is no candidate.
+
+        Velocity and acceleration limits are not looked at: the motion was made to keep them.
+        """
+        evaluation = self.plain(0).assess(as_batch(trajectory, self.config.samples))
+        return float(evaluation.cost[0]), bool(evaluation.valid[0])
+
+    def trajectory(self, points: NDArray) -> Trajectory:
+        """The timed trajectory through points (P, n), from ``start_time`` on."""
+        return self.plain(len(points)).trajectory(points, start_time=self.start_time)
+
+    def direct(self, previous: Trajectory | None) -> NDArray | None:
+        """No via-points: the goal is known whatever the previous solution was (4.4.1)."""
+        return np.zeros((0, self.limits.dof))
+
+    def shifted(self, previous: Trajectory, n_via: int) -> NDArray:
+        """What is left of the previous solution, resampled at even times (4.4.2)."""
+        begin = min(self.start_time, previous.end_time)
+        steps = np.arange(1, n_via + 1) / (n_via + 1)
+        return previous(begin + (previous.end_time - begin) * steps)
+
+    def prior(self, n_via: int) -> GaussianPrior:
+        """Smoothness prior (4.3.1)."""
+        return self.plain(n_via).prior(spread=self.config.spread)
+
+    def guesses(self, n_via: int) -> NDArray:
+        """The straight line (4.4.2), shape (1, N, n)."""
+        steps = np.arange(1, n_via + 1)[:, None] / (n_via + 1)
+        return (self.position + steps * (self.goal - self.position))[None]
+
+
+@dataclasses.dataclass(frozen=True)
+class JointSpacePlan:
+    """Outcome of one planning step.
+
+    Attributes:
+        trajectory: what to execute from the takeover on; it ends at rest.
+        mode: what the trajectory is. A new plan is "stop", "warm_start" or "explore" (Algorithm 1); "follow"
+            goes on with the present one, "brake" comes to rest, "escape" moves out of the way, and "hold"
+            stands at the goal.
+        searched: which mode of Algorithm 1 was tried, "" if none.
+        valid: whether the trajectory is known to reach the goal with all constraints satisfied.
+        cost: its cost, inf if it is not valid.
+        search: what the search reports, None without a search.
+    """
+
+    trajectory: Trajectory
+    mode: str
+    searched: str
+    valid: bool
+    cost: float
+    search: SearchResult | None = None
+
+
+class JointSpaceMpc:
+    """Plans step after step to a goal, from the motion that is being executed.
+
+    Safety: the executed motion is only replaced by a valid plan of lower cost, and goes on otherwise. When an
+    obstacle has moved into it and no valid plan is found, the first of these that is clear for ``lookahead``
+    seconds is taken: going on, braking, a short motion out of the way; without any, the one that breaks
+    least. All of them end at rest, and velocity and acceleration limits hold on all of them.
+    """
+
+    def __init__(self, limits: Limits, config: JointSpaceMpcConfig, rng: np.random.Generator) -> None:
+        self.limits, self.config, self.rng = limits, config, rng
+        self.online = OnlineVpsto(config.online, rng)
+        self._reference: Trajectory | None = None
+        self._solved = False
+
+    @property
+    def reference(self) -> Trajectory:
+        """The motion that is being executed.
+
+        Raises:
+            VpstoError: nothing is being executed; :meth:`begin` comes first.
+        """
+        if self._reference is None:
+            raise VpstoError("the planner does not know where the robot is; call begin() first")
+        return self._reference
+
+    def begin(self, position: ArrayLike, now: float, velocity: ArrayLike | None = None) -> Trajectory:
+        """Take over a robot, coming to rest if it moves; returns what to execute until the first plan.
+
+        Args:
+            position: shape (n,).
+            now: present time [s].
+            velocity: shape (n,), zero by default.
+
+        Raises:
+            InvalidInputError: a shape does not fit or a number is not finite.
+        """
+        speed = np.zeros(self.limits.dof) if velocity is None else velocity
+        self._reference = braking_trajectory(position, speed, self.limits, start_time=now)
+        self._solved = False
+        return self._reference
+
+    def accept(self, plan: JointSpacePlan) -> None:
+        """Take note that a plan is being executed."""
+        self._reference, self._solved = plan.trajectory, plan.valid
+
+    def step(
+        self,
+        takeover: float,
+        goal: ArrayLike,
+        terms: tuple[Term, ...] = (),
+        *,
+        tolerated: tuple[Term, ...] | None = None,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> JointSpacePlan:
+        """Plan once. Call :meth:`accept` when the plan is going to be executed.
+
+        Args:
+            takeover: time from which the plan will be executed [s]; until then the present motion goes on.
+            goal: where to come to rest, shape (n,).
+            terms: what new plans have to satisfy; moving obstacles as they will be at ``takeover``.
+            tolerated: what the present motion has to satisfy to be kept, with smaller margins for instance,
+                so that noise does not make it invalid; ``terms`` by default.
+            deadline: value of `clock` at which to return the best found so far.
+            clock: source of that time.
+
+        Raises:
+            InvalidInputError: the goal has another shape, is not finite or beyond its limits.
+            VpstoError: nothing is being executed yet.
+        """
+        kept, goal = remainder(self.reference, takeover), self._checked(goal)
+        problem = self._problem(kept, goal, terms)
+        judge = problem if tolerated is None else self._problem(kept, goal, tolerated)
+        cost, clear = judge.assess(kept)
+        arrives = clear and bool(np.abs(kept(kept.end_time) - goal).max() <= AT_GOAL)
+        if arrives and not kept(kept.times, 1).any() and self._ahead(judge, kept)[1]:
+            return JointSpacePlan(kept, "hold", "", True, cost)
+        self.online.accept(self.reference if clear and self._solved else None)
+        result = self.online.step(problem, deadline=deadline, clock=clock)
+        if result.trajectory is not None and not (arrives and cost <= result.cost):
+            return JointSpacePlan(
+                result.trajectory, result.mode, result.mode, True, result.cost, result.search
+            )
+        if arrives:
+            return JointSpacePlan(kept, "follow", result.mode, True, cost, result.search)
+        mode, motion = self._fallback(judge, kept)
+        return JointSpacePlan(motion, mode, result.mode, False, math.inf, result.search)
+
+    def _checked(self, goal: ArrayLike) -> NDArray:
+        """The goal, refused if no motion could end there."""
+        target, limits = np.array(goal, dtype=float), self.limits
+        if target.shape != (limits.dof,) or not np.isfinite(target).all():
+            raise InvalidInputError(f"the goal must be finite with shape ({limits.dof},), got {goal!r}")
+        for bound, beyond, side in ((limits.lower, np.less, "below"), (limits.upper, np.greater, "above")):
+            if bound is not None and beyond(target, bound).any():
+                joint = int(np.argmax(beyond(target, bound)))
+                raise InvalidInputError(
+                    f"the goal {target[joint]:.6g} of joint {joint + 1} is {side} its limit "
+                    f"{bound[joint]:.6g}"
+                )
+        return target
+
+    def _problem(self, kept: Trajectory, goal: NDArray, terms: tuple[Term, ...]) -> OnlineJointSpaceProblem:
+        position, velocity, _ = kept.state(kept.start_time)
+        return OnlineJointSpaceProblem(
+            self.limits, position=position, velocity=velocity, start_time=kept.start_time, goal=goal,
+            terms=terms, config=self.config,
+        )  # fmt: skip
+
+    def _ahead(self, judge: OnlineJointSpaceProblem, motion: Trajectory) -> tuple[float, bool]:
+        """Cost and validity of the next ``lookahead`` seconds, standing at the end of the motion included."""
+        end = motion.start_time + self.config.lookahead
+        return judge.assess(extended(motion, end).clipped(motion.start_time, end))
+
+    def _fallback(self, judge: OnlineJointSpaceProblem, kept: Trajectory) -> tuple[str, Trajectory]:
+        """What to do without a valid plan, and its name."""
+        brake = braking_trajectory(
+            judge.position, judge.velocity, self.limits, start_time=judge.start_time
+        )
+        options = [("follow", kept), ("brake", brake)]
+        costs = []
+        for mode, motion in options:
+            cost, clear = self._ahead(judge, motion)
+            if clear:
+                return mode, motion
+            costs.append(cost)
+        for motion in self._escapes(judge, brake(brake.end_time)):
+            cost, clear = self._ahead(judge, motion)
+            if clear:
+                return "escape", motion
+            options.append(("escape", motion))
+            costs.append(cost)
+        return options[int(np.argmin(costs))]
+
+    def _escapes(self, judge: OnlineJointSpaceProblem, centre: NDArray) -> list[Trajectory]:
+        """Direct motions to random positions around a centre, the cheapest first (and best, if clear)."""
+        limits, start = self.limits, judge.position
+        reach = 0.5 * self.config.lookahead * np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
+        ends = centre + self.rng.uniform(-1.0, 1.0, (self.config.escapes, limits.dof)) * reach
+        ends = np.maximum(ends, -np.inf if limits.lower is None else limits.lower)
+        ends = np.minimum(ends, np.inf if limits.upper is None else limits.upper)
+        basis, still = OptimalBasis.uniform(0), np.zeros(limits.dof)
+        keys = np.stack([np.broadcast_to(start, ends.shape), ends], axis=1)
+        batch = synthesize_batch(basis, keys, judge.velocity, still, limits, self.config.samples)
+        cost = judge.plain(0).assess(batch).cost
+        order = [i for i in np.argsort(cost, kind="stable") if np.isfinite(cost[i])]
+        return [
+            synthesize(basis, keys[i], judge.velocity, still, limits, start_time=judge.start_time)
+            for i in order[:MOST_ESCAPES]
+        ]
+
+
+def remainder(trajectory: Trajectory, start: float) -> Trajectory:
+    """What is left of a motion from `start` [s] on; when it is over, a moment at its last position."""
+    if start < trajectory.end_time - 1e-9:
+        return trajectory.clipped(start, trajectory.end_time)
+    return resting(trajectory(trajectory.end_time), start, start + MINIMUM_DURATION)
+
+
+def as_batch(trajectory: Trajectory, samples: int) -> TrajectoryBatch:
+    """One trajectory as a batch of one, so that cost terms can look at a motion that no candidate stands for.
+
+    Args:
+        trajectory: piecewise cubic; knots may be anywhere.
+        samples: number K of equally spaced phases.
+
+    Raises:
+        InvalidInputError: the trajectory is not piecewise cubic.
+    """
+    if trajectory.coefficients[:, 4:].any():
+        raise InvalidInputError("only a piecewise cubic trajectory can be written as a batch")
+    start, duration = trajectory.start_time, trajectory.duration
+    times = start + np.linspace(0.0, duration, samples)
+    knots = (trajectory.times - start) / duration
+    return TrajectoryBatch(
+        np.array([duration]), trajectory(times)[None], trajectory(times, 1)[None], trajectory(times, 2)[None],
+        trajectory(trajectory.times)[None], knots, duration * trajectory(trajectory.times, 1)[None],
+    )  # fmt: skip
