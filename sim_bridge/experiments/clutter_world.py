@@ -1,4 +1,4 @@
-"""The cluttered plane of Figs. 4.4 and 4.5: a point among three polygons, after the sampling-MPC literature."""
+"""The cluttered plane of Figs. 4.4 and 4.5: a point among three polygons."""
 
 from typing import Any
 

@@ -10,7 +10,7 @@ count of points.
 import copy
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,10 +42,7 @@ class MovingDisc:
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre", _vector("disc: centre", self.centre))
         object.__setattr__(self, "velocity", _vector("disc: velocity", self.velocity))
-        radius = np.asarray(self.radius)
-        if radius.shape != () or not np.isrealobj(radius) or not (np.isfinite(radius) and radius > 0.0):
-            raise InvalidInputError(f"disc: radius must be finite and positive, got {self.radius!r}")
-        object.__setattr__(self, "radius", float(radius))
+        object.__setattr__(self, "radius", _positive_number("disc: radius", self.radius))
 
     def position(self, time: float) -> NDArray[np.float64]:
         """Centre at a time [s], shape (2,) [m]."""
@@ -74,8 +71,8 @@ class Stay(NamedTuple):
 class PlanarWorld:
     """Free space in a plane: a box without polygons and discs. What is beyond the box counts as occupied.
 
-    Touching is allowed: an obstacle, or the space beyond a wall, is entered where a point is more than 1e-12 m
-    deep in it. Obstacles may overlap.
+    Touching is allowed: an obstacle, or the space beyond a wall, is entered where a point is more than
+    1e-12 m deep in it. Obstacles may overlap.
 
     Args:
         lower: corner of the box with the lowest coordinates, shape (2,) [m]; may be infinite.
@@ -85,8 +82,8 @@ class PlanarWorld:
         names: of the polygons, for messages; "polygon 1", "polygon 2", .. by default.
 
     Raises:
-        InvalidInputError: lower not below upper, a polygon with fewer than three corners, without area or with
-            edges that meet, names that do not fit, or numbers that are not finite.
+        InvalidInputError: lower not below upper, a polygon with fewer than three corners, without area or
+            with edges that meet, names that do not fit, or numbers that are not finite.
     """
 
     lower: NDArray[np.float64]
@@ -99,7 +96,7 @@ class PlanarWorld:
         lower = _vector("world: lower", self.lower, finite=False)
         upper = _vector("world: upper", self.upper, finite=False)
         if not np.all(lower < upper):
-            raise InvalidInputError(f"world: lower must be below upper, got {self.lower!r} and {self.upper!r}")
+            raise InvalidInputError(f"world: lower must be below upper, got {lower} and {upper}")
         names = tuple(self.names) or tuple(f"polygon {i + 1}" for i in range(len(self.polygons)))
         if len(names) != len(self.polygons):
             raise InvalidInputError(f"world: {len(names)} names for {len(self.polygons)} polygons")
@@ -260,11 +257,9 @@ class CollisionTerm:
     start_time: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.weight) and self.weight > 0.0 and np.isfinite(self.start_time)):
-            raise InvalidInputError(
-                f"collision term: the weight must be positive and the start time finite, got {self.weight!r} "
-                f"and {self.start_time!r}"
-            )
+        _positive_number("collision term: weight", self.weight)
+        if not np.isfinite(self.start_time):
+            raise InvalidInputError(f"collision term: start time must be finite, got {self.start_time!r}")
 
     def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Cost (B,) and validity (B,) of trajectories."""
@@ -293,8 +288,14 @@ def _vector(name: str, value: ArrayLike, finite: bool = True) -> NDArray[np.floa
     return array
 
 
+def _positive_number(name: str, value: Any) -> float:
+    if isinstance(value, (int, float, np.number)) and np.isfinite(value) and value > 0:
+        return float(value)
+    raise InvalidInputError(f"{name} must be finite and positive, got {value!r}")
+
+
 def _points_and_times(
-    points: ArrayLike, times: ArrayLike | None
+    points: ArrayLike, times: Any
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, ...]]:
     """Points (K, 2) and times (K,), contiguous, and the shape of the answer."""
     array = np.asarray(points, dtype=np.float64)

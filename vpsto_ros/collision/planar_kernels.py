@@ -1,9 +1,9 @@
 """Compiled kernels of a planar world: where a path is inside an obstacle, exactly, and distances of points.
 
-A piece of a path is a polynomial of degree d in 0 <= u <= 1, given by its control points (d + 1, 2). It is cut
-where it crosses the line of an edge within that edge, the circle of a disc or a wall; between two cuts it is
-inside or outside all along, which the middle tells. A piece whose control points stay clear of an obstacle's box
-is not looked at.
+A piece of a path is a polynomial of degree d in 0 <= u <= 1, given by its control points (d + 1, 2). It is
+cut where it crosses the line of an edge within that edge, the circle of a disc or a wall; between two cuts it
+is inside or outside all along, which the middle tells. A piece whose control points stay clear of an
+obstacle's box is not looked at.
 """
 
 import math
@@ -15,7 +15,7 @@ from numba import njit
 from vpsto_ros.collision.planar_roots import DEPTH, roots, value_and_slope
 
 TOUCH = 1e-12
-"""Depth [m] up to which an obstacle counts as touched, not entered: what round-off cannot tell from outside."""
+"""Depth [m] up to which an obstacle counts as touched: what round-off cannot tell from outside."""
 SHORTEST = 1e-12
 """Share of a piece below which a stay inside an obstacle is round-off at a corner."""
 
@@ -65,7 +65,7 @@ def workspace(world, degree):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def in_polygon(world, p, x, y):
-    """Whether a point is deeper than TOUCH inside polygon p: even-odd rule, then the distance to its edges."""
+    """Whether a point is deeper than TOUCH in polygon p: even-odd rule, then the distance to its edges."""
     odd = False
     for e in range(world.first[p], world.first[p + 1]):
         following = world.first[p] if e + 1 == world.first[p + 1] else e + 1
@@ -174,7 +174,7 @@ def _polygon_cuts(world, p, degree, hull, space):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _disc_cuts(radius, degree, space):
-    """Cuts of the piece, relative to the centre, with a circle: |q|^2 - r^2 in Bernstein form of degree 2 d."""
+    """Cuts of the piece, relative to the centre, with a circle: |q|^2 = r^2, a polynomial of degree 2 d."""
     form = space.form
     form[: 2 * degree + 1] = -0.5 * radius
     outer_i = 1.0  # binomial (d over i)
@@ -327,7 +327,7 @@ def stays(world, controls, times):
     """
     degree = controls.shape[1] - 1
     space = workspace(world, degree)
-    rows = []
+    rows: list[tuple[int, float, float]] = []
     for o in range(world.boxes.shape[0] + world.discs.shape[0] + 1):
         for s in range(len(controls)):
             start, end = times[s], times[s + 1]

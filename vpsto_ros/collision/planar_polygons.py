@@ -19,13 +19,13 @@ def checked_polygon(corners: ArrayLike, name: str) -> NDArray[np.float64]:
         name: of the polygon, for error messages.
 
     Raises:
-        InvalidInputError: fewer than three corners, not finite, an edge without length, no area, or edges that
-            touch or cross; the message says where.
+        InvalidInputError: fewer than three corners, not finite, an edge without length, no area, or edges
+            that touch or cross; the message says where.
     """
     try:
         polygon = np.array(corners, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name}: corners must be numbers of shape (V, 2), got {corners!r}") from error
+        raise InvalidInputError(f"{name}: corners must be numbers of shape (V, 2)") from error
     if polygon.ndim != 2 or polygon.shape[1] != 2 or len(polygon) < 3:
         raise InvalidInputError(f"{name} must have at least 3 corners of shape (V, 2), got {polygon.shape}")
     if not np.isfinite(polygon).all():
@@ -36,16 +36,11 @@ def checked_polygon(corners: ArrayLike, name: str) -> NDArray[np.float64]:
         raise InvalidInputError(
             f"{name}: corner {i + 1} and the next one are the same point {polygon[i].tolist()}"
         )
-    if abs(_area(polygon)) < _SMALLEST * lengths.max():
+    if np.linalg.svd(polygon - polygon.mean(axis=0), compute_uv=False)[1] < _SMALLEST:
         raise InvalidInputError(f"{name} has no area: all its corners are on one line")
     _refuse_touching_edges(polygon, name)
     polygon.setflags(write=False)
     return polygon
-
-
-def _area(polygon: NDArray) -> float:
-    x, y = (polygon - polygon[0]).T
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
 def _refuse_touching_edges(polygon: NDArray, name: str) -> None:

@@ -1,8 +1,8 @@
 """Roots of polynomials in Bernstein form, compiled: what makes collision checks along a path exact.
 
 A polynomial of degree d on 0 <= u <= 1 is given by its d + 1 Bernstein coefficients. It stays within their
-range and crosses zero at most as often as they change sign, so most polynomials need no arithmetic at all, and
-an interval with one change of sign holds exactly one root.
+range and crosses zero at most as often as they change sign, so most polynomials need no arithmetic at all,
+and an interval with one change of sign holds exactly one root.
 """
 
 import math
@@ -139,7 +139,6 @@ def from_powers(coefficients: np.ndarray) -> np.ndarray:
     """
     size = coefficients.shape[1]
     degree = size - 1
-    matrix = np.array(
-        [[math.comb(k, i) / math.comb(degree, i) if i <= k else 0.0 for i in range(size)] for k in range(size)]
-    )
+    ratios = [[math.comb(k, i) / math.comb(degree, i) for i in range(size)] for k in range(size)]
+    matrix = np.array(ratios)
     return np.einsum("ki,sin->skn", matrix, coefficients)
