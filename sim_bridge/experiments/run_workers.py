@@ -100,7 +100,6 @@ def on_cluster(
     Raises:
         ConfigurationError: when Dask is missing, nothing answers at the address, there are no workers, or
             they have another version of this package.
-        TrialError: when a task has killed several workers, or the scheduler is lost.
     """
     client = _connect(scheduler)
     try:
@@ -160,17 +159,17 @@ def _collect(
         indices[client.submit(_alone, trial, task, pure=False)] = index
     try:
         for future in as_completed(list(indices), loop=client.loop):
-            if future.status != "finished":
-                raise TrialError(_cluster_failure(future, indices[future]))
-            yield indices[future], future.result()
+            yield indices[future], _result(future)
     finally:
         with contextlib.suppress(Exception):  # the scheduler may be what was lost
             client.cancel(list(indices))
 
 
-def _cluster_failure(future: Any, index: int) -> str:
-    reason = future.exception() if future.status == "error" else "the scheduler is gone"
-    return f"task {index} was lost on the cluster: {reason}"
+def _result(future: Any) -> Outcome:
+    try:
+        return future.result()  # computed anew if the worker that had it has died meanwhile
+    except Exception as error:  # several workers have died of this task, or the scheduler is gone
+        return Outcome(error=f"on the cluster, {type(error).__name__}: {error}")
 
 
 _ONE_AT_A_TIME = threading.Lock()

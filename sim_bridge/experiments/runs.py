@@ -14,7 +14,6 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 from tqdm import tqdm
 
 from sim_bridge.experiments.run_store import RunStore, fingerprint
@@ -172,6 +171,8 @@ def describe(task: Any) -> str:
 
 def success_interval(successes: int, runs: int) -> tuple[float, float]:
     """Wilson's 95 % confidence interval of a success rate."""
+    from scipy.stats import binomtest  # takes a second to load, which every worker would spend
+
     interval = binomtest(successes, runs).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
