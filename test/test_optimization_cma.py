@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.optimization.cma import STRATEGIES, CmaEs, default_parameters, make_strategy
+from vpsto_ros.optimization.cma import STRATEGIES, CmaEs, default_parameters, has_collapsed, make_strategy
 
 
 def sphere(x):
@@ -134,6 +134,19 @@ def test_flat_costs_keep_the_numbers_sane():
         for _ in range(500):
             strategy.tell(strategy.ask(), np.zeros(10))
         assert np.isfinite(strategy.mean).all() and np.isfinite(strategy.sigma)
+
+
+@pytest.mark.parametrize("name", ["cma", "sep-cma"])
+@pytest.mark.parametrize("optimum", [0.0, 3.0])
+def test_runs_to_the_end_of_precision_and_then_stands_still(name, optimum):
+    strategy = make_strategy(name, 5, 12, np.random.default_rng(0), mean=np.ones(5))
+    for _ in range(2000):
+        samples = strategy.ask()
+        strategy.tell(samples, ellipsoid(samples - optimum))
+    np.testing.assert_allclose(strategy.mean, optimum, atol=1e-7)
+    assert has_collapsed(strategy) and strategy.sigma > 0.0
+    values = strategy.covariance_diagonal
+    assert np.isfinite(values).all() and values.min() > 0.0
 
 
 def test_one_dimension_works():

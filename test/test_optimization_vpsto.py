@@ -173,6 +173,72 @@ def test_stops_when_converged(prior):
     assert flat.status == "no valid plan" and flat.restarts == 2
 
 
+def test_convergence_may_have_to_last(prior):
+    iterations = [
+        run(prior, iterations=500, tolerance=1e-4, patience=patience).iterations for patience in (1, 5, 20)
+    ]
+    assert iterations[0] < iterations[1] < iterations[2] < 500
+
+
+def test_a_search_that_cannot_change_any_more_ends(prior):
+    for strategy in ("sep-cma", "cma", "pycma"):
+        result = run(prior, strategy=strategy, iterations=2000)
+        assert result.status == "converged" and result.iterations < 1000
+        np.testing.assert_allclose(result.points, TARGET, atol=1e-9)
+    nothing = run(prior, never_valid, iterations=5000, restarts=2)
+    assert nothing.status == "no valid plan" and nothing.iterations < 5000 and nothing.restarts == 2
+
+
+def two_valleys(points):
+    """A wide valley, and a deeper one that is narrower at -TARGET."""
+    deep = 3.0 * np.square(points + TARGET).sum(axis=(1, 2)) - 0.5
+    return Evaluation(np.minimum(distance(points), deep), np.ones(len(points), dtype=bool))
+
+
+def test_restarts_after_convergence_find_other_optima(prior):
+    once = [run(prior, two_valleys, seed=s, iterations=400, population=8).cost for s in range(8)]
+    options = {"iterations": 400, "population": 8, "tolerance": 1e-3, "patience": 5, "restarts": 50}
+    again = [run(prior, two_valleys, seed=s, restart="converged", **options) for s in range(8)]
+    assert np.sum(np.array(once) > -0.4) >= 2, "a single search often ends in the wide valley"
+    assert all(result.cost < -0.49 and 1 < result.restarts <= 50 for result in again)
+    assert all(len(result.history) <= 400 for result in again)
+
+
+def test_the_population_may_grow_at_every_restart(prior):
+    recorder = Recorder()
+    run(
+        prior, recorder, iterations=300, population=6, restarts=2, restart="converged", tolerance=1e-3,
+        population_growth=2.0, starts=2,
+    )  # fmt: skip
+    sizes = [len(batch) for batch in recorder.batches]
+    assert sorted(set(sizes)) == [12, 24, 48] and sizes == sorted(sizes)
+
+
+def test_a_clock_of_evaluations_makes_the_deadline_a_budget(prior):
+    recorder = Recorder()
+
+    def evaluations():
+        return sum(map(len, recorder.batches))
+
+    options = {"iterations": 10_000, "population": 10, "population_growth": 2.0, "restarts": 100}
+    result = run(
+        prior, recorder, deadline=1001, clock=evaluations, restart="converged", tolerance=1e-2, **options
+    )
+    assert result.status == "deadline" and 900 < result.evaluations == evaluations() <= 1000
+
+
+@pytest.mark.parametrize(("reserve", "done"), [("longest", 3), ("last", 7), ("none", 8)])
+def test_what_is_kept_free_before_the_deadline(prior, reserve, done):
+    now, durations = [0.0], iter([0.01, 0.05] + [0.01] * 50)
+
+    def slow(points):
+        now[0] += next(durations)
+        return bowl(points)
+
+    result = run(prior, slow, iterations=1000, deadline=0.1195, clock=lambda: now[0], reserve=reserve)
+    assert result.iterations == done and result.status == "deadline"
+
+
 def test_the_result_depends_on_the_generator_only(prior):
     first, second, other = run(prior), run(prior), run(prior, seed=1)
     np.testing.assert_array_equal(first.points, second.points)

@@ -196,7 +196,7 @@ def test_the_structured_form_equals_the_dense_one(n_via, end):
 
 
 def peak_memory(n):
-    """Bytes it takes to make a prior over 4 points of n degrees of freedom, to draw from it and to go back."""
+    """Bytes it takes to make a prior over 4 points of n degrees of freedom, to draw from it and back."""
     zeros, ones = np.zeros(n), np.ones(n)
     tracemalloc.start()
     prior = smoothness_prior(OptimalBasis.uniform(4), zeros, zeros, ones, zeros, 1.0, spread=0.1)

@@ -18,6 +18,11 @@ from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 STRATEGIES = ("sep-cma", "cma", "pycma", "pycma-sep")
 _SIGMA_RANGE = (1e-30, 1e30)
+_LARGEST_CONDITION = 1e14
+"""Of the covariance; beyond it the short axes are round-off (the same constant as in pycma)."""
+
+_RESOLUTION = 1e-12
+"""Standard deviation, relative to max(1, |mean|), below which samples hardly differ any more."""
 
 
 class Strategy(Protocol):
@@ -38,6 +43,12 @@ class Strategy(Protocol):
 
     def tell(self, samples: np.ndarray, costs: np.ndarray, injected: int = 0) -> None:
         """Learn from the costs (M,) of samples (M, D), of which the first `injected` came from elsewhere."""
+
+
+def has_collapsed(strategy: Strategy) -> bool:
+    """Whether samples no longer differ beyond round-off: there is nothing left to learn."""
+    finest = _RESOLUTION * max(1.0, float(np.abs(strategy.mean).max()))
+    return strategy.sigma**2 * float(strategy.covariance_diagonal.max()) < finest**2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,14 +159,14 @@ class CmaEs:
             samples: what was evaluated, shape (M, D): the result of :meth:`ask`, in which the first rows may
                 have been replaced by solutions from elsewhere.
             costs: shape (M,). Non-finite costs rank last and never contribute; if none is finite nothing is
-                learned.
+                learned. Nothing is learned either once the distribution :func:`has_collapsed`.
             injected: number of leading rows that did not come from :meth:`ask`. Their steps are shortened to
                 a length the distribution could have drawn, so that a distant one cannot blow up the
                 covariance.
         """
         self.iterations += 1
         order, weights, mu_eff = self._select(costs)
-        if not weights.size:
+        if not weights.size or has_collapsed(self):
             return
         steps = (samples[order] - self._mean) / self.sigma
         if injected:
@@ -212,6 +223,7 @@ class CmaEs:
         if self.separable:
             self._covariance = kept * self._covariance
             self._covariance += p.c_1 * self._path_c**2 + p.c_mu * (weights @ steps**2)
+            np.maximum(self._covariance, self._covariance.max() / _LARGEST_CONDITION, out=self._covariance)
             self._scales = np.sqrt(self._covariance)
             return
         rank_mu = (steps.T * (p.c_mu * weights)) @ steps
@@ -223,7 +235,7 @@ class CmaEs:
     def _decompose(self) -> None:
         values, self._basis = np.linalg.eigh(self._covariance)
         # Round-off can push the smallest eigenvalue of an ill-conditioned matrix below zero.
-        self._scales = np.sqrt(np.maximum(values, 1e-14 * values[-1]))
+        self._scales = np.sqrt(np.maximum(values, values[-1] / _LARGEST_CONDITION))
         self._since_decomposition = 0
 
 

@@ -44,13 +44,8 @@ def joint_limit_cost(batch: TrajectoryBatch, limits: Limits) -> tuple[np.ndarray
         Cost (B,) and validity (B,).
     """
     cost = np.zeros(len(batch.duration))
-    if limits.lower is None and limits.upper is None:
-        return cost, np.ones(len(cost), dtype=bool)
-    lowest, highest = position_extrema(batch)
-    if limits.lower is not None:
-        cost += np.where(lowest < limits.lower, 1.0 + limits.lower - lowest, 0.0).sum(axis=1)
-    if limits.upper is not None:
-        cost += np.where(highest > limits.upper, 1.0 + highest - limits.upper, 0.0).sum(axis=1)
+    if limits.lower is not None or limits.upper is not None:
+        joint_limit_kernel(batch.knots, batch.key_positions, batch.knot_slopes, *limits.position_range, cost)
     return cost, cost == 0.0
 
 
@@ -101,6 +96,22 @@ def position_extrema(batch: TrajectoryBatch) -> tuple[np.ndarray, np.ndarray]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _segment_extrema(q, step, left, right):
+    """Lowest and highest value after the start of a cubic from q to q + step with slopes left, right in u."""
+    c2, c3 = 3.0 * step - 2.0 * left - right, left + right - 2.0 * step
+    lowest = highest = q + step
+    # Roots of the slope left + 2 c2 u + 3 c3 u^2; division by zero fails the test below.
+    discriminant = c2 * c2 - 3.0 * left * c3
+    if discriminant >= 0.0:
+        half = -(c2 + np.copysign(np.sqrt(discriminant), c2))
+        for u in (half / (3.0 * c3), left / half):
+            if 0.0 < u < 1.0:
+                value = q + u * (left + u * (c2 + u * c3))
+                lowest, highest = min(lowest, value), max(highest, value)
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def extrema_kernel(knots, keys, slopes):
     """Lowest and highest value (B, n) of cubic Hermite segments through keys with slopes (B, N + 2, n)."""
     batch, size, dof = keys.shape
@@ -110,21 +121,21 @@ def extrema_kernel(knots, keys, slopes):
             h = knots[i + 1] - knots[i]
             for j in range(dof):
                 q, step = keys[b, i, j], keys[b, i + 1, j] - keys[b, i, j]
-                c1, right = h * slopes[b, i, j], h * slopes[b, i + 1, j]
-                c2, c3 = 3.0 * step - 2.0 * c1 - right, c1 + right - 2.0 * step
-                lowest[b, j] = min(lowest[b, j], q + step)
-                highest[b, j] = max(highest[b, j], q + step)
-                # Roots of the slope c1 + 2 c2 u + 3 c3 u^2; division by zero fails the test below.
-                discriminant = c2 * c2 - 3.0 * c1 * c3
-                if discriminant < 0.0:
-                    continue
-                half = -(c2 + np.copysign(np.sqrt(discriminant), c2))
-                for u in (half / (3.0 * c3), c1 / half):
-                    if 0.0 < u < 1.0:
-                        value = q + u * (c1 + u * (c2 + u * c3))
-                        lowest[b, j] = min(lowest[b, j], value)
-                        highest[b, j] = max(highest[b, j], value)
+                low, high = _segment_extrema(q, step, h * slopes[b, i, j], h * slopes[b, i + 1, j])
+                lowest[b, j], highest[b, j] = min(lowest[b, j], low), max(highest[b, j], high)
     return lowest, highest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def joint_limit_kernel(knots, keys, slopes, lower, upper, cost):
+    """Add 1 + excess for every limit (n,) that a candidate exceeds to its cost (B,)."""
+    lowest, highest = extrema_kernel(knots, keys, slopes)
+    for b in range(cost.size):
+        for j in range(lower.size):
+            if lowest[b, j] < lower[j]:
+                cost[b] += 1.0 + lower[j] - lowest[b, j]
+            if highest[b, j] > upper[j]:
+                cost[b] += 1.0 + highest[b, j] - upper[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -9,14 +9,14 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.optimization.cma import STRATEGIES, Strategy, make_strategy
-from vpsto_ros.priors.smoothness import GaussianPrior
+from vpsto_ros.optimization.cma import STRATEGIES, Strategy, has_collapsed, make_strategy
+from vpsto_ros.optimization.progress import RESERVES, Evaluation, Incumbents, Iteration, SearchResult, Timer
+from vpsto_ros.priors.gaussian import GaussianPrior
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,76 +29,31 @@ class VpstoConfig:
 
     population: int = option(32, "candidates per iteration and start", minimum=4, maximum=100_000)
     iterations: int = option(6, "iterations in total, restarts included", minimum=1, maximum=1_000_000)
-    restarts: int = option(
-        1, "how often to begin anew, wider, while nothing valid is known", minimum=0, maximum=100
+    restarts: int = option(1, "how often to begin anew at most", minimum=0, maximum=1000)
+    restart: str = option(
+        "invalid",
+        "when to begin anew: while nothing valid is known, or also once the search has converged",
+        choices=("invalid", "converged"),
     )
-    restart_widening: float = option(2.0, "factor on sigma at every restart", minimum=1.0, maximum=100.0)
+    restart_widening: float = option(
+        2.0, "factor on sigma at every restart while nothing valid is known", minimum=1.0, maximum=100.0
+    )
+    population_growth: float = option(
+        1.0, "factor on the population at every restart; 2 is IPOP", minimum=1.0, maximum=10.0
+    )
     starts: int = option(1, "independent starts searched side by side", minimum=1, maximum=1000)
     strategy: str = option("sep-cma", "evolution strategy", choices=STRATEGIES)
     sigma: float = option(1.0, "first standard deviation in units of the prior", minimum=1e-6, maximum=100.0)
     tolerance: float = option(
-        0.0, "stop when the best cost changes less per iteration; 0: never", minimum=0.0
+        0.0, "converged when the best cost of an iteration changes less; 0: only when it cannot", minimum=0.0
+    )
+    patience: int = option(1, "over how many iterations it has to", minimum=1, maximum=10_000)
+    reserve: str = option(
+        "longest", "time taken to be needed by one more iteration before a deadline", choices=RESERVES
     )
 
     def __post_init__(self) -> None:
         validate(self)
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluation:
-    """Costs of a batch of candidates, shape (B,), and which of them satisfy all constraints, shape (B,) bool.
-
-    Candidates are ranked by cost alone (4.3.3), so constraints need a cost as well, as in (4.16).
-    """
-
-    cost: np.ndarray
-    valid: np.ndarray
-
-
-class Iteration(NamedTuple):
-    """What one iteration saw.
-
-    Attributes:
-        best_cost: lowest cost in this iteration, valid or not.
-        best_valid_cost: lowest cost of a valid candidate so far, inf if there was none.
-        valid_count: how many candidates of this iteration were valid.
-        sigma: step size of the first start.
-    """
-
-    best_cost: float
-    best_valid_cost: float
-    valid_count: int
-    sigma: float
-
-
-@dataclasses.dataclass(frozen=True)
-class SearchResult:
-    """Outcome of a search.
-
-    Attributes:
-        points: best valid points, shape (P, n), or None if there are none.
-        cost: their cost, inf if there are none.
-        valid: whether there are any.
-        best_any_points: points of the lowest finite cost, valid or not, shape (P, n), or None if no cost was
-            finite.
-        best_any_cost: their cost, inf if there are none.
-        iterations, evaluations, restarts: how often each happened.
-        non_finite: number of candidates whose cost was not finite.
-        status: "converged", "iterations" (all of them done), "deadline" or "no valid plan".
-        history: one entry per iteration.
-    """
-
-    points: np.ndarray | None
-    cost: float
-    valid: bool
-    best_any_points: np.ndarray | None
-    best_any_cost: float
-    iterations: int
-    evaluations: int
-    restarts: int
-    non_finite: int
-    status: str
-    history: tuple[Iteration, ...]
 
 
 Evaluate = Callable[[np.ndarray], Evaluation]
@@ -122,8 +77,9 @@ def search(
     The populations of all starts are evaluated in one batch. The first one also contains the mean of every
     start, so a warm start is never worse than what it started from. With more means than starts, all means
     are evaluated first and the cheapest become starts. While nothing valid is known, the remaining iterations
-    are divided among the remaining restarts; every restart widens sigma. The result is the same for the same
-    ``rng`` as long as no deadline hits.
+    are divided among the remaining restarts; every such restart widens sigma. With ``restart = "converged"``
+    a search that has converged begins anew with what is left of its iterations, to find other local optima.
+    The result is the same for the same ``rng`` as long as no deadline hits.
 
     Args:
         prior: Gaussian over the P points; also the metric of the search.
@@ -137,116 +93,113 @@ def search(
             starts, each at its own mean.
         sigma: first standard deviation of this search instead of ``config.sigma``.
         deadline: time of ``clock`` by which to be back. Checked before every iteration: one that would take
-            as long as the longest so far must still fit.
-        clock: reads the time in seconds.
+            as long as ``config.reserve`` says must still fit.
+        clock: reads the time in seconds. A clock that counts evaluations makes the deadline a budget of them.
 
     Raises:
         InvalidInputError: shapes do not fit, or ``evaluate`` returned something else than costs (B,) and
             validity (B,).
     """
-    best, timer = _Incumbents(), _Timer(deadline, clock)
+    best, timer = Incumbents(), Timer(deadline, clock, config.reserve)
     starts = _latent_starts(prior, config, mean, means)
     if len(starts) > config.starts:
         starts = _cheapest(prior, evaluate, starts, config.starts, best)
-    injections = _injections(prior, config, starts, seeds)
-    widths = _widths(config, sigma)
+    injections, widths = _injections(prior, config, starts, seeds), _widths(config, sigma)
     history: list[Iteration] = []
-    restarts, round_end = 0, _round_end(config, 0, 0)
-    strategies = _begin(config, starts, widths[0], rng)
-    fresh, status = True, "iterations"
+    restarts, status = 0, "iterations"
+    attempt = _Attempt(config, injections, widths[0], rng, 0, restarts)
 
     while len(history) < config.iterations:
         if timer.expired():
             status = "deadline"
             break
-        samples = np.stack([strategy.ask() for strategy in strategies])  # latent variables, (S, M, D)
-        injected = _inject(samples, injections) if fresh else [0] * len(strategies)
-        points = prior.to_points(samples.reshape(-1, prior.dimension))  # eq. (4.4)
+        points = prior.to_points(attempt.ask())  # eq. (4.4)
         evaluation = _checked(evaluate(points), len(points))  # synthesis and costs, 4.3.2 and 4.3.3
         count = best.update(points, evaluation)
-        history.append(Iteration(float(evaluation.cost.min()), best.cost, count, strategies[0].sigma))
-        for strategy, sample, cost, count in zip(
-            strategies, samples, evaluation.cost.reshape(len(strategies), -1), injected, strict=True
-        ):
-            strategy.tell(sample, cost, count)
-        fresh = False
-        converged = _converged(history, config.tolerance)
-        if converged and best.valid:
+        history.append(Iteration(float(evaluation.cost.min()), best.cost, count, attempt.sigma))
+        attempt.tell(evaluation.cost)
+        used_up = not best.valid and len(history) >= attempt.end
+        if not (used_up or attempt.converged):
+            continue
+        if restarts < config.restarts and not (best.valid and config.restart == "invalid"):
+            restarts += 1
+            width = config.sigma if best.valid else widths[restarts]
+            attempt = _Attempt(config, injections, width, rng, len(history), restarts)
+        elif attempt.collapsed or (attempt.converged and best.valid):
             status = "converged"
             break
-        if not best.valid and restarts < config.restarts and (converged or len(history) >= round_end):
-            restarts += 1
-            round_end = _round_end(config, len(history), restarts)
-            strategies = _begin(config, starts, widths[restarts], rng)
-            fresh = True
 
     return best.result(history, restarts, status)
 
 
-class _Incumbents:
-    """The best candidates so far."""
+class _Attempt:
+    """The search from its starts until it converges or its share of the iterations is used up.
 
-    def __init__(self) -> None:
-        self.points: np.ndarray | None = None
-        self.cost = math.inf
-        self.any_points: np.ndarray | None = None
-        self.any_cost = math.inf
-        self.evaluations = 0
-        self.non_finite = 0
+    Args:
+        config: options.
+        injections: latent variables that join the first population of every start, its mean first.
+        sigma: first step size.
+        rng: source of randomness.
+        done: iterations done before.
+        restarts: which restart this is, 0 for the first attempt.
+    """
+
+    def __init__(
+        self,
+        config: VpstoConfig,
+        injections: list[np.ndarray],
+        sigma: float,
+        rng: np.random.Generator,
+        done: int,
+        restarts: int,
+    ) -> None:
+        population = round(config.population * config.population_growth**restarts)
+        self._strategies: list[Strategy] = [
+            make_strategy(config.strategy, rows.shape[1], population, rng, sigma=sigma, mean=rows[0])
+            for rows in injections
+        ]
+        self._injections, self._config = injections, config
+        self._samples = np.empty((len(injections), population, injections[0].shape[1]))
+        self._best: list[float] = []
+        # If nothing valid is found: an equal share of what is left.
+        self.end = done + math.ceil((config.iterations - done) / (config.restarts - restarts + 1))
 
     @property
-    def valid(self) -> bool:
-        return self.points is not None
+    def sigma(self) -> float:
+        """Step size of the first start."""
+        return self._strategies[0].sigma
 
-    def update(self, points: np.ndarray, evaluation: Evaluation) -> int:
-        """Take in a batch; returns how many of it are valid."""
-        cost, valid = evaluation.cost, evaluation.valid
-        self.evaluations += len(cost)
-        self.non_finite += int(np.count_nonzero(cost == math.inf))
-        lowest = int(cost.argmin())
-        best_cost = float(cost[lowest])
-        if best_cost < self.any_cost:
-            self.any_cost, self.any_points = best_cost, points[lowest].copy()
-        count = int(np.count_nonzero(valid))
-        if count:
-            lowest = int(np.where(valid, cost, math.inf).argmin())
-            if cost[lowest] < self.cost:
-                self.cost, self.points = float(cost[lowest]), points[lowest].copy()
-        return count
+    def ask(self) -> np.ndarray:
+        """Latent variables of the populations of all starts, shape (S M, D)."""
+        for rows, strategy in zip(self._samples, self._strategies, strict=True):
+            rows[:] = strategy.ask()
+        if not self._best:
+            for rows, injection in zip(self._samples, self._injections, strict=True):
+                rows[: len(injection)] = injection
+        return self._samples.reshape(-1, self._samples.shape[2])
 
-    def result(self, history: list[Iteration], restarts: int, status: str) -> SearchResult:
-        return SearchResult(
-            points=self.points,
-            cost=self.cost,
-            valid=self.valid,
-            best_any_points=self.any_points,
-            best_any_cost=self.any_cost,
-            iterations=len(history),
-            evaluations=self.evaluations,
-            restarts=restarts,
-            non_finite=self.non_finite,
-            status=status if self.valid else "no valid plan",
-            history=tuple(history),
-        )
+    def tell(self, cost: np.ndarray) -> None:
+        """Learn from the costs (S M,)."""
+        costs = cost.reshape(len(self._strategies), -1)
+        first = not self._best
+        for strategy, rows, row, injection in zip(
+            self._strategies, self._samples, costs, self._injections, strict=True
+        ):
+            strategy.tell(rows, row, len(injection) if first else 0)
+        self._best.append(float(cost.min()))
 
+    @property
+    def collapsed(self) -> bool:
+        """Whether no start can find anything else any more."""
+        return all(map(has_collapsed, self._strategies))
 
-class _Timer:
-    """Tells when the next iteration would end too late."""
-
-    def __init__(self, deadline: float | None, clock: Callable[[], float]) -> None:
-        self._deadline = deadline
-        self._clock = clock
-        self._last: float | None = None
-        self._longest = 0.0
-
-    def expired(self) -> bool:
-        if self._deadline is None:
-            return False
-        now = self._clock()
-        if self._last is not None:
-            self._longest = max(self._longest, now - self._last)
-        self._last = now
-        return now + self._longest >= self._deadline
+    @property
+    def converged(self) -> bool:
+        """The criterion of 4.5.3, |c_k - c_{k-1}| below the tolerance, or that it cannot change any more."""
+        patience, recent = self._config.patience, self._best[-1 - self._config.patience :]
+        # The difference of infinite costs is nan, which is not below the tolerance.
+        settled = len(recent) > patience and max(recent) - min(recent) < self._config.tolerance
+        return settled or self.collapsed
 
 
 def _latent_starts(
@@ -266,7 +219,7 @@ def _latent_starts(
 
 
 def _cheapest(
-    prior: GaussianPrior, evaluate: Evaluate, latent: np.ndarray, count: int, best: _Incumbents
+    prior: GaussianPrior, evaluate: Evaluate, latent: np.ndarray, count: int, best: Incumbents
 ) -> np.ndarray:
     points = prior.to_points(latent)
     evaluation = _checked(evaluate(points), len(points))
@@ -307,24 +260,6 @@ def _widths(config: VpstoConfig, sigma: float | None) -> list[float]:
     return [first] + [widest * config.restart_widening ** (i + 1) for i in range(config.restarts)]
 
 
-def _round_end(config: VpstoConfig, done: int, restarts: int) -> int:
-    """Iteration at which the present round gives up if nothing is valid: an equal share of what is left."""
-    return done + math.ceil((config.iterations - done) / (config.restarts - restarts + 1))
-
-
-def _begin(config: VpstoConfig, starts: np.ndarray, sigma: float, rng: np.random.Generator) -> list[Strategy]:
-    return [
-        make_strategy(config.strategy, start.size, config.population, rng, sigma=sigma, mean=start)
-        for start in starts
-    ]
-
-
-def _inject(samples: np.ndarray, injections: list[np.ndarray]) -> list[int]:
-    for sample, injection in zip(samples, injections, strict=True):
-        sample[: len(injection)] = injection
-    return [len(injection) for injection in injections]
-
-
 def _checked(evaluation: Evaluation, size: int) -> Evaluation:
     """Costs that are not finite become +inf and invalid."""
     cost = np.asarray(evaluation.cost, dtype=float)
@@ -338,11 +273,3 @@ def _checked(evaluation: Evaluation, size: int) -> Evaluation:
     if finite.all():
         return Evaluation(cost, valid)
     return Evaluation(np.where(finite, cost, math.inf), valid & finite)
-
-
-def _converged(history: list[Iteration], tolerance: float) -> bool:
-    """The criterion of 4.5.3, |c_k - c_{k-1}| below the tolerance."""
-    if tolerance <= 0 or len(history) < 2:
-        return False
-    change = abs(history[-1].best_cost - history[-2].best_cost)  # nan if both are infinite
-    return change < tolerance

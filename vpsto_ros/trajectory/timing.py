@@ -13,6 +13,9 @@ from vpsto_ros.trajectory.kernels import MINIMUM_DURATION, durations_kernel, syn
 
 __all__ = ["MINIMUM_DURATION", "Limits", "TrajectoryBatch", "minimal_duration", "synthesize_batch"]
 
+POSITION_TOLERANCE = 1e-9
+"""Excess over a position limit, relative to max(1, |limit|), that still counts as being on the limit."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Limits:
@@ -60,6 +63,19 @@ class Limits:
     def dof(self) -> int:
         """Number n of degrees of freedom."""
         return self.velocity.size
+
+    @functools.cached_property
+    def position_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Smallest and largest position (n,) that count as within the limits; infinite without a limit.
+
+        They are 1e-9 max(1, |limit|) wider than the limits, because round-off of a motion that ends on a
+        limit is no violation; :meth:`vpsto_ros.trajectory.Trajectory.violations` allows the same.
+        """
+        unlimited = np.full(self.dof, np.inf)
+        lower = -unlimited if self.lower is None else self.lower
+        upper = unlimited if self.upper is None else self.upper
+        slack = [POSITION_TOLERANCE * np.maximum(1.0, np.abs(limit)) for limit in (lower, upper)]
+        return lower - slack[0], upper + slack[1]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
