@@ -49,6 +49,11 @@ _DH = np.array(
 _TIP = FLANGE_OFFSET + TOOL_LENGTH
 
 
+def dh_table() -> NDArray[np.float64]:
+    """Rows (a, d, cos alpha, sin alpha) of the modified DH table of joints 1..7, a copy, shape (7, 4)."""
+    return _DH.copy()
+
+
 @njit(cache=True, nogil=True)
 def _tip_motion(dh, tip, q, qd, position, velocity):
     """Positions and, if the array is not empty, velocities of the tips, shapes (B, 3).

@@ -1,0 +1,77 @@
+"""The arm's collision as a term of the search."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.collision import arm_path_kernels as paths
+from vpsto_ros.collision.arm import TOLERANCE, ArmCollision
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.trajectory import Trajectory, TrajectoryBatch
+
+
+class ArmPathCost:
+    """Cost of a batch of motions of the arm; valid are those that are proven free at every instant.
+
+    The cost is the share of the samples in collision, each weighted by one plus its depth, so that a
+    candidate that only grazes is better than one that passes through the middle of an obstacle: a plain count
+    cannot tell these apart and gives the search no direction. A motion without such a sample is proven free
+    between the samples too; where that fails it costs half a sample and is invalid.
+
+    Args:
+        checker: the arm in its cell; a sample closer than its margin counts.
+        weight: factor on the cost.
+        proof_margin: distance [m] that is proven of valid motions; smaller than the margin of the checker, so
+            that motions that keep the margin at their samples rarely fail between them.
+        depth_scale: overlap [m] that counts as much as being in collision at all.
+    """
+
+    def __init__(
+        self,
+        checker: ArmCollision,
+        *,
+        weight: float = 100.0,
+        proof_margin: float = 0.0,
+        depth_scale: float = 0.05,
+        tolerance: float = TOLERANCE,
+    ) -> None:
+        if not 0.0 <= proof_margin <= checker.margin:
+            raise InvalidInputError(
+                f"proof_margin must be from 0 to the margin of the checker, {checker.margin}, "
+                f"got {proof_margin!r}"
+            )
+        if not (weight > 0.0 and depth_scale > 0.0 and tolerance > 0.0):
+            raise InvalidInputError("weight, depth_scale and tolerance must be positive")
+        self.checker = checker
+        self.weight = weight
+        self.proof_margin = proof_margin
+        self.depth_scale = depth_scale
+        self.tolerance = tolerance
+
+    def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Cost (B,) and validity (B,)."""
+        if batch.position.shape[-1] != 7:
+            raise InvalidInputError(f"expected motions of 7 joints, got {batch.position.shape[-1]}")
+        cost = np.empty(len(batch.position))
+        paths.batch_cost(
+            self.checker.model.arrays,
+            self.checker.cell,
+            batch.position,
+            batch.knots,
+            batch.key_positions,
+            batch.knot_slopes,
+            self.checker.margin,
+            self.proof_margin,
+            self.tolerance,
+            self.depth_scale,
+            cost,
+        )
+        return self.weight * cost, cost == 0.0
+
+    def explain(self, trajectory: Trajectory) -> list[str]:
+        """What a motion collides with, in words."""
+        found = self.checker.free_along(trajectory, margin=self.proof_margin, tolerance=self.tolerance)
+        if found.free:
+            return []
+        return self.checker.explain(trajectory) or [
+            f"{contact} at {found.time:.3f} s" for contact in found.contacts
+        ]
