@@ -19,6 +19,7 @@ examples:
   vpsto experiment push_box --runs 20         20 random boxes, in lock-step and without ROS
   vpsto experiment push_box --resume          go on with an experiment that was stopped
   vpsto bench --json bench.json               how long search, replanning and simulation take here
+  vpsto bench --compare bench.json            and what has changed since
 
 exit status: 0 success, 1 the run failed, 2 the command was not understood
 """
@@ -107,6 +108,14 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
     bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
     bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")
+    bench.add_argument("--compare", metavar="FILE", help="say what changed since --json wrote this file")
+    bench.add_argument(
+        "--fail-above",
+        type=positive,
+        metavar="X",
+        help="exit with 1 if a row takes more than X times as long as in the file to compare with",
+    )
+    bench.add_argument("--quick", action="store_true", help="a few calls per row: does every row work?")
     bench.set_defaults(module="sim_bridge.bench")
     warm_up = commands.add_parser("warm-up", help="compile the numerical kernels into the disk cache")
     warm_up.set_defaults(module="sim_bridge.warm_up")

@@ -1,52 +1,235 @@
 import argparse
 import json
+import os
 
 import numpy as np
 import pytest
 
-from sim_bridge import bench
-from vpsto_ros.exceptions import InvalidInputError
+from sim_bridge import bench, cli
+from sim_bridge.bench import library_rows, system_rows
+from sim_bridge.bench.comparison import compare
+from sim_bridge.bench.growth import exponent, growth_tables
+from sim_bridge.bench.measuring import (
+    QUICK,
+    Cores,
+    Effort,
+    Row,
+    durations,
+    measure_once,
+    on_cores,
+    statistics,
+)
+from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+
+
+def instant(_cores):
+    return lambda: None
+
+
+def options(**changes):
+    given = {"json": None, "only": None, "compare": None, "fail_above": None, "quick": True}
+    return argparse.Namespace(**given | changes)
+
+
+def row_entries(name, p50, cores=1, **more):
+    return {"name": name, "cores": cores, "p50_ms": p50, "p99_ms": p50, "max_ms": p50, **more}
 
 
 def test_rows_have_the_promised_columns(tmp_path, monkeypatch, capsys):
-    fast = {
-        "first": lambda: bench.statistics([0.001, 0.003], cores=1),
-        "second": lambda: bench.statistics([0.5], cores=2),
-    }
-    monkeypatch.setattr(bench, "BENCHMARKS", fast)
-    assert bench.run(argparse.Namespace(json=str(tmp_path / "bench.json"), only=None)) == 0
+    monkeypatch.setattr(bench, "usable_cores", lambda: 2)
+    monkeypatch.setattr(bench, "ROWS", (Row("first", instant), Row("second", instant)))
+    assert bench.run(options(json=str(tmp_path / "bench.json"))) == 0
     rows = json.loads((tmp_path / "bench.json").read_text())
-    assert [row["name"] for row in rows] == ["first", "second"]
-    assert set(rows[0]) == {"name", "cores", "p50_ms", "p99_ms", "max_ms"}
-    assert rows[0]["p50_ms"] == pytest.approx(2.0)
-    assert rows[0]["max_ms"] == pytest.approx(3.0)
-    assert "first" in capsys.readouterr().out
+    assert [(row["name"], row["cores"]) for row in rows] == [
+        ("first", 1), ("first", 2), ("second", 1), ("second", 2),
+    ]  # fmt: skip
+    assert set(rows[0]) == {"name", "cores", "p50_ms", "p99_ms", "max_ms", "noise"}
+    printed = capsys.readouterr().out
+    assert [line.split()[:2] for line in printed.splitlines()[1:5]] == [
+        ["first", "1"], ["first", "2"], ["second", "1"], ["second", "2"],
+    ]  # fmt: skip
+
+
+def test_on_a_single_core_there_are_no_rows_for_two(monkeypatch, capsys):
+    monkeypatch.setattr(bench, "usable_cores", lambda: 1)
+    rows = bench.measure_all([Row("first", instant)], QUICK)
+    assert [row["cores"] for row in rows] == [1]
+    assert "only one core" in capsys.readouterr().out
+
+
+def test_published_names_stay_and_are_unique():
+    names = [row.name for row in bench.ROWS]
+    assert len(set(names)) == len(names)
+    assert {
+        "synthesis_b100_n7_via4_k50", "vpsto_iteration_b64_n7_box", "mpc_step_push_box", "driver",
+        "first_plan", "posture_checks", "basis_n7_via4_k50", "evaluate_n7_k1000",
+    } <= set(names)  # fmt: skip
 
 
 def test_an_unknown_row_is_refused_with_those_that_exist():
     with pytest.raises(InvalidInputError, match="synthesis_b100_n7_via4_k50"):
-        bench.run(argparse.Namespace(json=None, only="nothing"))
+        bench.run(options(only="nothing"))
 
 
-def test_percentiles_are_of_the_durations():
+def test_statistics_are_of_the_durations():
     seconds = list(np.linspace(0.0, 0.1, 101))
-    row = bench.statistics(seconds, cores=1)
-    assert row["p50_ms"] == pytest.approx(50.0)
-    assert row["p99_ms"] == pytest.approx(99.0)
-    assert row["max_ms"] == pytest.approx(100.0)
+    entries = statistics(Row("a", instant), 1, [seconds[:50], seconds[50:]])
+    assert entries["p50_ms"] == pytest.approx(50.0)
+    assert entries["p99_ms"] == pytest.approx(99.0)
+    assert entries["max_ms"] == pytest.approx(100.0)
 
 
-def test_every_row_measures_something(monkeypatch):
-    monkeypatch.setattr(
-        bench, "repeat", lambda action, times: bench.statistics(bench.measure(action, 2), cores=1)
-    )
-    for measure in (bench.synthesis, bench.vpsto_iteration):
-        assert measure()["p50_ms"] > 0.0
+def test_noise_is_what_parts_of_the_measurement_differ_by():
+    row = Row("a", instant)
+    steady = [[1.0, 1.1, 1.0] * 8] * 3
+    assert statistics(row, 1, steady)["noise"] == pytest.approx(0.0)
+    drifting = [[1.0] * 24, [1.2] * 24, [1.4] * 24]
+    assert statistics(row, 1, drifting)["noise"] == pytest.approx(np.std([1.0, 1.2, 1.4]) / 1.2)
+
+
+def test_a_row_derives_further_figures_from_its_median():
+    row = Row("a", instant, derived=system_rows.real_time_factor)
+    assert statistics(row, 1, [[0.1, 0.1]])["real_time_factor"] == pytest.approx(10.0)
+    assert library_rows.checks_per_second(0.001) == {"checks_per_s": pytest.approx(1e6)}
+
+
+@pytest.mark.parametrize("row", library_rows.ROWS, ids=lambda row: row.name)
+@pytest.mark.parametrize("cores", [1, 2])
+def test_every_row_of_the_library_measures_something(row, cores):
+    assert min(measure_once(row, cores, QUICK)) > 0.0
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3])
+@pytest.mark.parametrize("size", [1, 2, 7])
+def test_shared_work_is_all_done_once(cores, size):
+    place, done = Cores(cores), np.zeros(size, dtype=int)
+
+    def work(part):
+        done[part] += 1
+
+    with place.cleanup:
+        action = place.shared(work, size)
+        action()
+        action()
+    np.testing.assert_array_equal(done, 2)
+
+
+def test_an_error_in_another_thread_is_not_lost():
+    place = Cores(2)
+
+    def work(part):
+        if part.start > 0:
+            raise ValueError("second half")
+
+    with place.cleanup, pytest.raises(ValueError, match="second half"):
+        place.shared(work, 4)()
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot pin processes")
+def test_one_core_means_one_core():
+    before = os.sched_getaffinity(0)
+    with on_cores(1):
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+
+
+def test_the_number_of_calls():
+    assert len(measure_once(Row("a", instant, calls=9), 1, Effort())) == 9
+    assert len(measure_once(Row("a", instant, calls=9), 1, QUICK)) == 4
+    assert len(measure_once(Row("a", instant), 1, Effort(seconds=0.1, calls=50))) == 50
+    assert durations(lambda: [1.0, 2.0], 2, own_times=True) == [1.0, 2.0, 1.0, 2.0]
 
 
 def test_the_row_of_the_driver_node_is_there_with_ros_and_leaves_no_context():
     rclpy = pytest.importorskip("rclpy")
-    row = bench.BENCHMARKS["driver_node"]()
-    assert row["p50_ms"] > 0.0
-    assert row["real_time_factor"] == pytest.approx(1e3 / row["p50_ms"])
+    (row,) = (row for row in bench.ROWS if row.name == "driver_node")
+    assert min(measure_once(row, 1, Effort(calls=1))) > 0.0
     assert not rclpy.ok()
+
+
+def test_growth_is_fitted_and_missing_rows_leave_the_table_out():
+    assert exponent([1, 2, 4], [3.0, 6.0, 12.0]) == pytest.approx(1.0)
+    rows = [
+        row_entries(f"synthesis_b{b}_n{n}_via4_k50", 1e-3 * n * b**1.5)
+        for n in library_rows.DOF
+        for b in library_rows.BATCHES
+    ]
+    table = growth_tables(rows)
+    assert table.count("1.50") == len(library_rows.DOF)
+    assert table.splitlines()[-1].count("1.00") == len(library_rows.BATCHES)
+    assert growth_tables(rows[1:]) == ""
+
+
+def verdicts(old, new):
+    return {change["name"]: change["verdict"] for change in compare(old, new)}
+
+
+def test_a_change_counts_when_it_is_beyond_the_noise():
+    noisy = [row_entries("a", 1.0, noise=0.1), row_entries("b", 1.0, noise=0.001)]
+    later = [row_entries("a", 1.3, noise=0.1), row_entries("b", 1.3, noise=0.001)]
+    assert verdicts(noisy, later) == {"a": "same", "b": "slower"}
+    assert verdicts(later, noisy) == {"a": "same", "b": "faster"}
+    assert verdicts(noisy, noisy) == {"a": "same", "b": "same"}
+
+
+def test_a_difference_of_a_few_percent_is_never_a_change():
+    old = [row_entries("a", 1.0, noise=0.0)]
+    assert verdicts(old, [row_entries("a", 1.04, noise=0.0)]) == {"a": "same"}
+    assert verdicts(old, [row_entries("a", 1.06, noise=0.0)]) == {"a": "slower"}
+
+
+def test_old_files_without_noise_or_rows_are_compared_as_far_as_they_go():
+    old = [row_entries("a", 1.0), row_entries("gone", 1.0)]
+    new = [row_entries("a", 2.0, noise=0.4), row_entries("a", 2.0, cores=2, noise=0.0)]
+    (change,) = compare(old, new)
+    assert (change["name"], change["cores"], change["ratio"]) == ("a", 1, 2.0)
+    assert change["verdict"] == "same" and change["band"] == pytest.approx(3.0 * np.hypot(0.4, 0.4))
+
+
+@pytest.fixture
+def one_row(monkeypatch):
+    monkeypatch.setattr(bench, "ROWS", (Row("only", lambda cores: lambda: [0.002], own_times=True),))
+
+
+@pytest.mark.parametrize(
+    ("old_ms", "arguments", "status"),
+    [(1.0, [], 0), (1.0, ["--fail-above", "1.5"], 1), (1.95, ["--fail-above", "1.5"], 0)],
+)
+def test_comparison_from_the_command_line(tmp_path, capsys, one_row, old_ms, arguments, status):
+    old = [row_entries("only", old_ms), row_entries("gone", 1.0)]
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    command = ["bench", "--quick", "--compare", str(tmp_path / "old.json"), *arguments]
+    assert cli.main(command) == status
+    printed = capsys.readouterr().out
+    assert f"{2.0 / old_ms:.2f}" in printed and ("slower" in printed) == (old_ms == 1.0)
+    assert "only old: gone (1 core)" in printed
+    assert ("FAILED: more than 1.5 times as long: only" in printed) == (status == 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "No such file"),
+        ("{", "not JSON"),
+        ("[]", "not a file written by"),
+        ('{"name": "a"}', "not a file written by"),
+        ('[{"name": "a", "p50_ms": 0.0}]', "not a file written by"),
+        ('[{"name": "a", "p50_ms": "1"}]', "not a file written by"),
+        ('[{"name": "a", "p50_ms": NaN}]', "not a file written by"),
+    ],
+)
+def test_what_cannot_be_compared_with_is_refused_before_measuring(tmp_path, content, message, monkeypatch):
+    monkeypatch.setattr(bench, "measure_all", None)
+    path = tmp_path / "old.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ConfigurationError, match=f"old.json.*{message}"):
+        bench.run(options(compare=str(path)))
+
+
+def test_options_that_cannot_work_are_refused_before_measuring(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "measure_all", None)
+    with pytest.raises(ConfigurationError, match="--fail-above needs --compare"):
+        bench.run(options(fail_above=1.5))
+    with pytest.raises(ConfigurationError, match="there is no such folder"):
+        bench.run(options(json=str(tmp_path / "nowhere" / "bench.json")))

@@ -1,0 +1,95 @@
+"""``vpsto bench``: how long the building blocks take on this machine, on one core and on two."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+from tqdm import tqdm
+
+from sim_bridge.bench import library_rows, system_rows
+from sim_bridge.bench.comparison import compare, comparison_table, read_rows
+from sim_bridge.bench.growth import growth_tables
+from sim_bridge.bench.measuring import QUICK, Effort, Row, measure_once, statistics, usable_cores
+from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+
+ROWS: tuple[Row, ...] = library_rows.ROWS + system_rows.ROWS
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, print tables and write JSON if asked to.
+
+    Args:
+        arguments: json (file or None), only (part of a name or None), compare (file or None), fail_above
+            (ratio or None), quick (bool).
+
+    Returns:
+        1 when a row takes more than `fail_above` times as long as in the file to compare with, else 0.
+
+    Raises:
+        InvalidInputError: when no row has such a name.
+        ConfigurationError: when a file cannot be read, has no rows, or cannot be written.
+    """
+    rows = [row for row in ROWS if not arguments.only or arguments.only in row.name]
+    if not rows:
+        names = ", ".join(row.name for row in ROWS)
+        raise InvalidInputError(f"no row is called {arguments.only!r}; there are {names}")
+    if arguments.fail_above is not None and not arguments.compare:
+        raise ConfigurationError("--fail-above needs --compare FILE")
+    old = read_rows(arguments.compare) if arguments.compare else None
+    if arguments.json and not pathlib.Path(arguments.json).absolute().parent.is_dir():
+        raise ConfigurationError(f"--json {arguments.json}: there is no such folder")
+    measured = measure_all(rows, QUICK if arguments.quick else Effort())
+    if arguments.json:
+        pathlib.Path(arguments.json).write_text(json.dumps(measured, indent=2) + "\n")
+    growth = growth_tables(measured)
+    if growth:
+        print(f"\n{growth}", end="")
+    return 0 if old is None else report_changes(old, measured, arguments.fail_above)
+
+
+def measure_all(rows: Sequence[Row], effort: Effort) -> list[dict[str, Any]]:
+    """Measure every row on one core and on two, in passes over all of them; print each as it is complete."""
+    counts = [count for count in (1, 2) if count <= usable_cores()]
+    if counts == [1]:
+        print("only one core may be used here: no rows for two")
+    places = [(row, cores) for row in rows for cores in counts]
+    passes: dict[tuple[str, int], list[list[float]]] = {(row.name, cores): [] for row, cores in places}
+    results = []
+    print(f"{'name':34s} {'cores':>5s} {'p50 [ms]':>10s} {'p99 [ms]':>10s} {'max [ms]':>10s}", flush=True)
+    with tqdm(total=effort.passes * len(places), disable=None, leave=False) as bar:
+        for number in range(effort.passes):
+            for row, cores in places:
+                bar.set_description(f"{row.name}, {cores} core{'s' if cores > 1 else ''}")
+                passes[row.name, cores].append(measure_once(row, cores, effort))
+                bar.update()
+                if number == effort.passes - 1:
+                    results.append(statistics(row, cores, passes[row.name, cores]))
+                    bar.write(line(results[-1]))
+    return results
+
+
+def line(row: dict[str, Any]) -> str:
+    """One row of the printed table."""
+    times = " ".join(f"{row[key]:10.4f}" for key in ("p50_ms", "p99_ms", "max_ms"))
+    extra = f"   {row['real_time_factor']:.1f} x real time" if "real_time_factor" in row else ""
+    if "checks_per_s" in row:
+        extra = f"   {row['checks_per_s'] / 1e6:.2f} million checks per second"
+    return f"{row['name']:34s} {row['cores']:5d} {times}{extra}"
+
+
+def report_changes(
+    old: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]], fail_above: float | None
+) -> int:
+    """Print what became faster or slower; 1 when a row became slower by more than is allowed."""
+    changes = compare(old, new)
+    print(f"\n{comparison_table(changes, old, new)}", end="")
+    if fail_above is None:
+        return 0
+    worse = [change["name"] for change in changes if change["ratio"] > fail_above]
+    verdict = f"FAILED: more than {fail_above:g} times as long: {', '.join(worse)}" if worse else "passed"
+    print(f"verdict: {verdict}")
+    return 1 if worse else 0
