@@ -1,6 +1,7 @@
 """Cost terms against fine sampling and SciPy, and VP-STO from end to end."""
 
 import doctest
+import re
 
 import numpy as np
 import pytest
@@ -20,7 +21,14 @@ from vpsto_ros.optimization.costs import (
     smoothness_cost,
 )
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
-from vpsto_ros.trajectory import Limits, OptimalBasis, minimal_duration, synthesize, synthesize_batch
+from vpsto_ros.trajectory import (
+    MINIMUM_DURATION,
+    Limits,
+    OptimalBasis,
+    minimal_duration,
+    synthesize,
+    synthesize_batch,
+)
 
 LIMITS = Limits(np.array([1.0, 0.8]), np.array([2.0, 3.0]), np.array([-0.6, -0.5]), np.array([1.2, 0.9]))
 V0, VT = np.array([0.4, -0.3]), np.array([0.1, 0.5])
@@ -198,6 +206,120 @@ def test_the_prior_uses_the_duration_of_the_direct_motion():
     duration = minimal_duration(OptimalBasis.uniform(0), ends, velocity, np.zeros(2), PLANE)
     curve = CubicSpline([0, 1], ends, bc_type=((1, velocity * duration), (1, np.zeros(2))))
     np.testing.assert_allclose(problem.prior().mean_points, curve([0.25, 0.5, 0.75]), atol=1e-12)
+
+
+class DiscTerm:
+    """A term that can say what it means."""
+
+    def __init__(self, centre, radius, **flags):
+        self.centre, self.radius = np.asarray(centre), radius
+        self.__dict__.update(flags)
+
+    def __call__(self, batch):
+        depth = (self.radius - np.linalg.norm(batch.position - self.centre, axis=2)).max(axis=1)
+        return 10.0 * np.maximum(depth, 0.0), depth < 0.0
+
+    def explain(self, trajectory):
+        t = np.linspace(trajectory.start_time, trajectory.end_time, 200)
+        distance = np.linalg.norm(trajectory(t) - self.centre, axis=1).min()
+        return [f"in the disc at {self.centre}"] if distance <= self.radius else []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"start": np.array([0.0, -0.7])}, r"start \(0, -0\.7\): position of joint 2: -0\.7 < -0\.6"),
+        ({"goal": np.array([1.3, 0.0])}, r"goal \(1\.3, 0\): position of joint 1: 1\.3 > 1\.2"),
+        ({"start": np.array([0.4, 0.1])}, r"start \(0\.4, 0\.1\): in collision"),
+        ({"goal": np.array([0.5, 0.2])}, r"goal \(0\.5, 0\.2\): in collision"),
+        ({"terms": (DiscTerm([0.0, 0.1], 0.2),)}, r"start \(0, 0\): in the disc at"),
+        ({"terms": (DiscTerm([1.0, 0.1], 0.2),)}, r"goal \(1, 0\): in the disc at"),
+        ({"terms": (DiscTerm([1.0, 0.1], 0.2).__call__,)}, r"goal \(1, 0\): in the disc at"),
+        ({"terms": (DiscTerm([0.0, 0.1], 0.2, static=False),)}, "start"),
+    ],
+)
+def test_ends_that_allow_no_valid_motion_are_refused(change, message):
+    arguments = {"start": np.zeros(2), "goal": np.array([1.0, 0.0]), "collision": disc} | change
+    with pytest.raises(InvalidInputError, match=message):
+        JointSpaceProblem(OptimalBasis.uniform(3), PLANE, **arguments)
+    problem = JointSpaceProblem(OptimalBasis.uniform(3), PLANE, **arguments, check_ends=False)
+    points = problem.prior(spread=0.3).sample(np.random.default_rng(0), 20)
+    assert not problem.evaluate(points).valid.any()
+
+
+def test_a_moving_obstacle_may_be_at_the_goal_for_now():
+    around_the_disc(terms=(DiscTerm([1.0, 0.1], 0.2, static=False),))
+
+
+def test_ends_on_a_limit_are_fine_in_spite_of_round_off():
+    problem = JointSpaceProblem(
+        OptimalBasis.uniform(1), PLANE, np.array([-0.6, np.nextafter(1.2, 2)]), np.array([1.2, 0.0])
+    )
+    assert problem.evaluate(np.zeros((1, 1, 2)) + 0.1).valid.all()
+
+
+def test_staying_where_one_is_takes_no_time():
+    problem = JointSpaceProblem(OptimalBasis.uniform(3), PLANE, np.full(2, 0.4), np.full(2, 0.4))
+    result = search(problem.prior(spread=0.3), problem.evaluate, VpstoConfig(), np.random.default_rng(0))
+    assert result.valid and result.cost == pytest.approx(MINIMUM_DURATION, rel=1e-9)
+    still = problem.trajectory(result.points)
+    assert still.violations(PLANE) == []
+    np.testing.assert_allclose(still(np.linspace(0, 1e-3, 9)), 0.4, rtol=1e-12)
+
+
+def test_explain_says_why_a_candidate_is_invalid_and_only_then():
+    problem = around_the_disc(terms=(DiscTerm([0.5, 0.5], 0.1),))
+    points = problem.prior(spread=0.5).sample(np.random.default_rng(3), 200)
+    valid = problem.evaluate(points).valid
+    assert 10 < valid.sum() < 190
+    reasons = [problem.explain(candidate) for candidate in points]
+    assert [not lines for lines in reasons] == valid.tolist()
+    text = "\n".join(line for lines in reasons for line in lines)
+    assert "position of joint 2: " in text and "in the disc at [0.5 0.5]" in text
+    assert re.search(r"in collision at \d+ of 50 evaluation points, first at 0\.\d+ s in \(", text)
+
+
+def test_a_problem_without_a_solution_is_said_to_have_none_and_why():
+    def wall(q):
+        return np.abs(q[..., 0] - 0.5) < 0.3
+
+    def in_time(batch):
+        return batch.duration, batch.duration < 0.1
+
+    problem = around_the_disc(collision=wall, terms=(in_time,))
+    config = VpstoConfig(iterations=20, restarts=2)
+    result = search(problem.prior(spread=0.3), problem.evaluate, config, np.random.default_rng(0))
+    assert result.status == "no valid plan" and result.points is None and not result.valid
+    *_, collided, late = problem.explain(result.best_any_points)
+    assert collided.startswith("in collision at") and late.startswith("in_time is not satisfied (cost ")
+    too_fast = around_the_disc(start_velocity=np.array([1.5, 0.0]))
+    assert "boundary speed 1.5 of joint 1 is beyond its limit" in too_fast.explain(np.zeros((3, 2)))[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"basis": 3}, "basis must be an OptimalBasis"),
+        ({"limits": 1.0}, "limits must be Limits"),
+        ({"samples": 1}, "samples must be an integer from 2 on"),
+        ({"samples": 50.0}, "samples must be an integer from 2 on"),
+        ({"start": np.array([np.nan, 0.0])}, "start must be finite"),
+        ({"start_velocity": [0.0]}, r"start_velocity must be finite with shape \(2,\)"),
+        ({"terms": (3,)}, "must be functions"),
+        ({"collision": np.zeros(3)}, "must be functions"),
+        ({"collision": lambda q: q}, r"must return bool of shape \(1, 1\)"),
+    ],
+)
+def test_problems_that_make_no_sense_are_refused(change, message):
+    arguments = {"basis": OptimalBasis.uniform(1), "limits": PLANE, "start": np.zeros(2), "goal": np.ones(2)}
+    with pytest.raises(InvalidInputError, match=message):
+        JointSpaceProblem(**(arguments | change))
+
+
+@pytest.mark.parametrize("options", [{"spread": 0.0}, {"spread": np.nan}, {"weights": np.zeros(2)}])
+def test_priors_that_make_no_sense_are_refused(options):
+    with pytest.raises(InvalidInputError, match="finite and positive"):
+        around_the_disc().prior(**options)
 
 
 def test_errors_name_what_is_wrong():

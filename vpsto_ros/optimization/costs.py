@@ -9,12 +9,13 @@ import dataclasses
 import numpy as np
 
 from vpsto_ros.configuration import option, validate
-from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.terms import (
     CollisionCheck,
     Term,
     collision_cost,
     duration_cost,
+    in_collision,
     joint_limit_cost,
     position_extrema,
     pushing_progress_cost,
@@ -23,6 +24,7 @@ from vpsto_ros.optimization.terms import (
 from vpsto_ros.optimization.vpsto import Evaluation
 from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
 from vpsto_ros.trajectory import (
+    MINIMUM_DURATION,
     Limits,
     OptimalBasis,
     Trajectory,
@@ -101,12 +103,20 @@ class JointSpaceProblem:
         end_velocity: shape (n,), zero by default.
         collision: maps positions (B, K, n) to collisions (B, K) of bool; None for free space. It sees only
             the evaluation points, so obstacles need a margin of half the distance between two of them.
-        terms: further costs, each mapping a batch to cost (B,) and validity (B,); their weights are 1.
+        terms: further costs, each mapping a batch to cost (B,) and validity (B,); their weights are 1. A term
+            may have a method ``explain(trajectory) -> list[str]`` that says in words what a trajectory
+            collides with, and, if its obstacles move, ``static = False``.
         weights: of the other terms.
-        samples: evaluation points K.
+        samples: evaluation points K >= 2.
+        check_ends: whether to refuse a start or goal from which, or to which, no valid motion exists: beyond
+            a position limit, or in collision. A controller that has to cope with such states switches it off;
+            then every candidate is invalid.
+
+    Start and goal may be the same: standing still, for ``MINIMUM_DURATION``, is then the optimum from rest.
 
     Raises:
-        InvalidInputError: a shape does not fit.
+        InvalidInputError: a shape or type does not fit, a number is not finite, or ``check_ends`` found
+            something: the message says which end, where, and what is wrong with it.
     """
 
     basis: OptimalBasis
@@ -119,8 +129,17 @@ class JointSpaceProblem:
     terms: tuple[Term, ...] = ()
     weights: CostWeights = dataclasses.field(default_factory=CostWeights)
     samples: int = 50
+    check_ends: bool = True
 
     def __post_init__(self) -> None:
+        _check_kind("basis", self.basis, OptimalBasis, "an OptimalBasis, such as OptimalBasis.uniform(3)")
+        _check_kind("limits", self.limits, Limits, "Limits")
+        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 2:
+            raise InvalidInputError(f"samples must be an integer from 2 on, got {self.samples!r}")
+        object.__setattr__(self, "terms", tuple(self.terms))
+        for check in (*self.terms, self.collision):
+            if check is not None and not callable(check):
+                raise InvalidInputError(f"collision and terms must be functions of a batch, got {check!r}")
         n = self.limits.dof
         for name in ("start", "goal", "start_velocity", "end_velocity"):
             value = getattr(self, name)
@@ -130,6 +149,25 @@ class JointSpaceProblem:
             if array.shape != (n,) or not np.isfinite(array).all():
                 raise InvalidInputError(f"{name} must be finite with shape ({n},), got {value!r}")
             object.__setattr__(self, name, array)
+        for name in ("start", "goal") if self.check_ends else ():
+            wrong = [] if getattr(self, name) is None else self._end_conflicts(name)
+            if wrong:
+                raise InvalidInputError(f"{name} {_coordinates(getattr(self, name))}: {'; '.join(wrong)}")
+
+    def _end_conflicts(self, name: str) -> list[str]:
+        """Why no valid motion can start or end where this one does."""
+        position = getattr(self, name)
+        standing = Trajectory.from_points(
+            np.array([0.0, MINIMUM_DURATION]), np.stack([position] * 2), np.zeros((2, self.limits.dof))
+        )
+        wrong = standing.violations(self.limits)
+        if self.collision is not None and in_collision(position[None, None], self.collision).any():
+            wrong.append("in collision")
+        for term in self.terms:
+            # An obstacle that moves can be gone by the time the goal is reached.
+            if name == "start" or getattr(_owner(term), "static", True):
+                wrong += _explained(term, standing) or []
+        return wrong
 
     @property
     def n_points(self) -> int:
@@ -148,9 +186,8 @@ class JointSpaceProblem:
         guess = minimal_duration(
             OptimalBasis.uniform(0), ends, self.start_velocity, self.end_velocity, self.limits
         )
-        duration = (
-            float(guess) if np.isfinite(guess) else 1.0
-        )  # nothing will be valid then, but the prior exists
+        # Without a feasible duration nothing will be valid, but the prior exists.
+        duration = float(guess) if np.isfinite(guess) else 1.0
         return smoothness_prior(
             self.basis,
             self.start,
@@ -178,16 +215,13 @@ class JointSpaceProblem:
 
     def evaluate(self, points: np.ndarray) -> Evaluation:
         """Costs of candidates (B, P, n), for :func:`vpsto_ros.optimization.vpsto.search`."""
-        batch = synthesize_batch(
-            self.basis,
-            self.key_positions(points),
-            self.start_velocity,
-            self.end_velocity,
-            self.limits,
-            self.samples,
+        return self.assess(self._synthesize(self.key_positions(points)))
+
+    def _synthesize(self, keys: np.ndarray) -> TrajectoryBatch:
+        return synthesize_batch(
+            self.basis, keys, self.start_velocity, self.end_velocity, self.limits, self.samples,
             derivatives=bool(self.terms),
-        )
-        return self.assess(batch)
+        )  # fmt: skip
 
     def assess(self, batch: TrajectoryBatch) -> Evaluation:
         """Costs of trajectories that are there already, also of ones that no candidate stands for."""
@@ -215,3 +249,53 @@ class JointSpaceProblem:
         return synthesize(
             self.basis, keys, self.start_velocity, self.end_velocity, self.limits, start_time=start_time
         )
+
+    def explain(self, points: np.ndarray) -> list[str]:
+        """What keeps one candidate from being valid, in words; empty if it is valid.
+
+        For the ``best_any_points`` of a search that found nothing valid, for instance.
+
+        Args:
+            points: shape (P, n).
+        """
+        keys = self.key_positions(points[None])
+        batch = self._synthesize(keys)
+        try:
+            trajectory = self.trajectory(points)
+        except InfeasibleError as error:
+            return [str(error)]
+        wrong = trajectory.violations(self.limits)
+        if self.collision is not None:
+            hits = np.flatnonzero(in_collision(batch.position, self.collision)[0])
+            if hits.size:
+                time = float(batch.duration[0]) * hits[0] / (self.samples - 1)
+                wrong.append(
+                    f"in collision at {hits.size} of {self.samples} evaluation points, first at {time:.3f} s "
+                    f"in {_coordinates(batch.position[0, hits[0]])}"
+                )
+        for term in self.terms:
+            cost, valid = term(batch)
+            if not valid[0]:
+                name = getattr(term, "__name__", type(term).__name__)
+                wrong += _explained(term, trajectory) or [f"{name} is not satisfied (cost {cost[0]:.6g})"]
+        return wrong
+
+
+def _check_kind(name: str, value: object, kind: type, expected: str) -> None:
+    if not isinstance(value, kind):
+        raise InvalidInputError(f"{name} must be {expected}; got {value!r}")
+
+
+def _coordinates(position: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in position) + ")"
+
+
+def _owner(term: Term) -> object:
+    """The object whose method a term is, or the term itself."""
+    return getattr(term, "__self__", term)
+
+
+def _explained(term: Term, trajectory: Trajectory) -> list[str] | None:
+    """What a term says of a trajectory, None if it cannot."""
+    explain = getattr(_owner(term), "explain", None)
+    return None if explain is None else list(explain(trajectory))

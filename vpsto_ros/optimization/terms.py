@@ -49,12 +49,12 @@ def joint_limit_cost(batch: TrajectoryBatch, limits: Limits) -> tuple[np.ndarray
     return cost, cost == 0.0
 
 
-def collision_cost(batch: TrajectoryBatch, in_collision: CollisionCheck) -> tuple[np.ndarray, np.ndarray]:
+def collision_cost(batch: TrajectoryBatch, check: CollisionCheck) -> tuple[np.ndarray, np.ndarray]:
     """Number of evaluation points in collision.
 
     Args:
         batch: trajectories.
-        in_collision: maps positions (B, K, n) to collisions (B, K) of bool.
+        check: maps positions (B, K, n) to collisions (B, K) of bool.
 
     Returns:
         Cost (B,) and validity (B,).
@@ -62,14 +62,23 @@ def collision_cost(batch: TrajectoryBatch, in_collision: CollisionCheck) -> tupl
     Raises:
         InvalidInputError: the check returned another shape.
     """
-    hit = np.asarray(in_collision(batch.position))
-    if hit.shape != batch.position.shape[:2] or hit.dtype != bool:
+    count = in_collision(batch.position, check).sum(axis=1)
+    return count.astype(float), count == 0
+
+
+def in_collision(positions: np.ndarray, check: CollisionCheck) -> np.ndarray:
+    """What the check says of positions (B, K, n): collisions (B, K) of bool.
+
+    Raises:
+        InvalidInputError: the check returned something else.
+    """
+    hit = np.asarray(check(positions))
+    if hit.shape != positions.shape[:2] or hit.dtype != bool:
         raise InvalidInputError(
-            f"the collision check must return bool of shape {batch.position.shape[:2]}, "
+            f"the collision check must return bool of shape {positions.shape[:2]}, "
             f"got {hit.dtype} of shape {hit.shape}"
         )
-    count = hit.sum(axis=1)
-    return count.astype(float), count == 0
+    return hit
 
 
 def pushing_progress_cost(
