@@ -261,6 +261,11 @@ class CollisionTerm:
         if not np.isfinite(self.start_time):
             raise InvalidInputError(f"collision term: start time must be finite, got {self.start_time!r}")
 
+    @property
+    def static(self) -> bool:
+        """Whether no obstacle moves, so that a goal in collision stays one."""
+        return not self.world.discs
+
     def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Cost (B,) and validity (B,) of trajectories."""
         share, valid = self.world.time_in_collision(batch, self.start_time)
