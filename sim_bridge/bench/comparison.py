@@ -8,8 +8,6 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from sim_bridge.experiments.runs import markdown_table
 from vpsto_ros.exceptions import ConfigurationError
 
@@ -59,7 +57,7 @@ def compare(old: Sequence[Entries], new: Sequence[Entries]) -> list[Entries]:
         earlier = before.get((row["name"], row["cores"]))
         if earlier is None:
             continue
-        noise = float(np.hypot(row["noise"], earlier.get("noise", row["noise"])))
+        noise = math.hypot(row["noise"], earlier["noise"] if "noise" in earlier else row["noise"])
         band = max(SMALLEST_BAND, BAND_WIDTH * noise)
         ratio = row["p50_ms"] / earlier["p50_ms"]
         verdict = "slower" if ratio > 1.0 + band else "faster" if ratio * (1.0 + band) < 1.0 else "same"
