@@ -107,7 +107,7 @@ class OnlineJointSpaceProblem:
             self._plain[n_via] = JointSpaceProblem(
                 OptimalBasis.uniform(n_via), self.limits, self.position, self.goal,
                 start_velocity=self.velocity, terms=self.terms,
-                weights=self.config.weights, samples=self.config.samples,
+                weights=self.config.weights, samples=self.config.samples, check_ends=False,
             )  # fmt: skip
         return self._plain[n_via]
 
@@ -153,9 +153,9 @@ class JointSpacePlan:
 
     Attributes:
         trajectory: what to execute from the takeover on; it ends at rest.
-        mode: what the trajectory is. A new plan is "stop", "warm_start" or "explore" (Algorithm 1); "follow"
-            goes on with the present one, "brake" comes to rest, "escape" moves out of the way, and "hold"
-            stands at the goal.
+        mode: what the trajectory is. A new plan is "stop", "warm_start" or "explore" (Algorithm 1); "keep"
+            goes on with the present one, which is valid and no worse; "hold" stands at the goal. Without a
+            valid plan, "follow" goes on for now, "brake" comes to rest and "escape" moves out of the way.
         searched: which mode of Algorithm 1 was tried, "" if none.
         valid: whether the trajectory is known to reach the goal with all constraints satisfied.
         cost: its cost, inf if it is not valid.
@@ -255,7 +255,7 @@ class JointSpaceMpc:
                 result.trajectory, result.mode, result.mode, True, result.cost, result.search
             )
         if arrives:
-            return JointSpacePlan(kept, "follow", result.mode, True, cost, result.search)
+            return JointSpacePlan(kept, "keep", result.mode, True, cost, result.search)
         mode, motion = self._fallback(judge, kept)
         return JointSpacePlan(motion, mode, result.mode, False, math.inf, result.search)
 
@@ -325,6 +325,8 @@ class JointSpaceMpc:
 
 def remainder(trajectory: Trajectory, start: float) -> Trajectory:
     """What is left of a motion from `start` [s] on; when it is over, a moment at its last position."""
+    if abs(start - trajectory.start_time) < 1e-9:  # a knot there would leave a sliver that stands still
+        return trajectory
     if start < trajectory.end_time - 1e-9:
         return trajectory.clipped(start, trajectory.end_time)
     return resting(trajectory(trajectory.end_time), start, start + MINIMUM_DURATION)
