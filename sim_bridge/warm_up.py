@@ -1,4 +1,7 @@
-"""``vpsto warm-up``: compile every kernel into the disk cache by running the closed loop for a moment."""
+"""``vpsto warm-up``: compile every kernel into the disk cache by using everything for a moment.
+
+Processes that start together would each compile what the cache lacks.
+"""
 
 from __future__ import annotations
 
@@ -7,43 +10,84 @@ import time
 
 import numpy as np
 
-from sim_bridge.experiments.pushing_loop import PushingLoop
-from sim_bridge.simulation import Simulation
+from sim_bridge.bench.library_rows import cell
+from sim_bridge.experiments import clutter_mpc_runs
+from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS
+from sim_bridge.experiments.pushing_loop import push_box_loop
+from vpsto_ros.collision.arm import ArmCollision
+from vpsto_ros.collision.arm_cost import ArmPathCost
+from vpsto_ros.collision.planar import MovingDisc
 from vpsto_ros.contact.geometry import PlanarShape
-from vpsto_ros.contact.pushing import PushingModel
-from vpsto_ros.planning.contact import ContactPlannerConfig, PushContactPlanner
-from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.pushing import PushingMpc
-from vpsto_ros.planning.pushing_config import PushingMpcConfig
+from vpsto_ros.contact.pushing import PushingModel, push_directions
+from vpsto_ros.optimization.costs import JointSpaceProblem, position_extrema
+from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.robot.kinematics import fr3_pusher
-
-
-def push_box_loop(goal: PlanarGoal | None = None, seed: int = 0) -> PushingLoop:
-    """The demo's closed loop in lock-step: default cell, default planner, compiled and ready.
-
-    Args:
-        goal: where the box shall go, by default 11 cm aside.
-        seed: of camera and search.
-    """
-    model = PushingModel(PlanarShape.box(0.12, 0.12), PlanarShape.disc(0.015))
-    planner = PushingMpc(PushingMpcConfig(), model, fr3_pusher(), np.random.default_rng(seed))
-    planner.warm_up()
-    target = goal or PlanarGoal(np.array([0.55, 0.10]), None)
-    contact_planner = PushContactPlanner(ContactPlannerConfig(), model)
-    return PushingLoop(Simulation(seed=seed), planner, contact_planner, lambda now: target)
+from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch
+from vpsto_ros.trajectory.key_timing import time_key_positions
 
 
 def run(_arguments: argparse.Namespace | None = None) -> int:
-    """Run the loop until the first plan has reached the simulated arm.
+    """Push a box, evaluate trajectories, plan among obstacles.
 
     Returns:
         0.
     """
     began = time.perf_counter()
-    loop = push_box_loop()
-    loop.advance(0.5)
+    for use in (push_a_box, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
+        use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
     return 0
+
+
+def push_a_box() -> None:
+    """Contact, estimation, replanning and the simulated arm, until the first plan has reached it."""
+    push_box_loop().advance(0.5)
+    model = PushingModel(PlanarShape.box(0.12, 0.12), PlanarShape.disc(0.015))
+    push_directions(model, np.array([[-0.075, 0.0]]), np.array([[1.0, 0.0]]))
+
+
+def evaluate_a_trajectory() -> None:
+    """All that a trajectory can be asked for."""
+    limits = Limits(np.ones(2), np.ones(2))
+    keys = np.array([[0.0, 0.0], [0.3, 0.1], [1.0, 0.5]])
+    trajectory = time_key_positions(keys, limits).trajectory
+    times = np.linspace(0.0, trajectory.duration, 5)
+    trajectory(times), trajectory(0.1), trajectory.state(0.1)
+    trajectory.violations(limits)
+    trajectory.clipped(0.1, trajectory.duration)
+    rest = np.zeros(2)
+    position_extrema(synthesize_batch(OptimalBasis.uniform(1), keys, rest, rest, limits, 5))
+
+
+def plan_in_clutter() -> None:
+    """A point among polygons, with a disc that moves."""
+    world = CLUTTER.with_discs((MovingDisc(np.array([0.05, 0.45]), 0.02, np.array([0.01, 0.0])),))
+    ends = STARTS["start_0.10_0.20"], GOAL
+    trajectory = _search(JointSpaceProblem(OptimalBasis.uniform(2), LIMITS, *ends, terms=(world.term(),)))
+    world.clearance(trajectory(np.linspace(0.0, trajectory.duration, 5)))
+    world.inside(ends[0])
+    world.explain(trajectory)
+    for baseline in (False, True):
+        clutter_mpc_runs.warm_up(baseline)
+
+
+def plan_in_a_cell() -> None:
+    """The arm among boxes, capsules, spheres and half-spaces."""
+    checker = ArmCollision(obstacles=cell(), margin=0.01)
+    middle = np.mean(fr3_pusher().limits.position_range, axis=0)
+    ends, limits = (middle, middle + 0.1), fr3_pusher().limits
+    problem = JointSpaceProblem(OptimalBasis.uniform(1), limits, *ends, terms=(ArmPathCost(checker),))
+    trajectory = _search(problem)
+    checker.in_collision(middle)
+    checker.distance(middle)
+    checker.free_along(trajectory)
+    checker.explain(trajectory)
+
+
+def _search(problem: JointSpaceProblem) -> Trajectory:
+    config = VpstoConfig(population=4, iterations=2)
+    result = search(problem.prior(), problem.evaluate, config, np.random.default_rng(0))
+    return problem.trajectory(result.best_any_points)
 
 
 if __name__ == "__main__":

@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 
 from sim_bridge.simulation import Simulation
 from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
+from vpsto_ros.contact.geometry import PlanarShape
+from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.estimation.planar_kalman import PlanarKalman
-from vpsto_ros.planning.contact import PushContactPlanner
+from vpsto_ros.planning.contact import ContactPlannerConfig, PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushing import MpcStep, PushingMpc
-from vpsto_ros.robot.kinematics import forward_kinematics_batch
+from vpsto_ros.planning.pushing_config import PushingMpcConfig
+from vpsto_ros.robot.kinematics import forward_kinematics_batch, fr3_pusher
 from vpsto_ros.trajectory import Trajectory
 
 
@@ -137,3 +140,18 @@ class PushingLoop:
         recording.goal.append(np.append(goal.position, np.nan if goal.yaw is None else goal.yaw))
         recording.mode.append(step.mode)
         recording.compute.append(compute)
+
+
+def push_box_loop(goal: PlanarGoal | None = None, seed: int = 0) -> PushingLoop:
+    """The demo's closed loop in lock-step: default cell, default planner, compiled and ready.
+
+    Args:
+        goal: where the box shall go, by default 11 cm aside.
+        seed: of camera and search.
+    """
+    model = PushingModel(PlanarShape.box(0.12, 0.12), PlanarShape.disc(0.015))
+    planner = PushingMpc(PushingMpcConfig(), model, fr3_pusher(), np.random.default_rng(seed))
+    planner.warm_up()
+    target = goal or PlanarGoal(np.array([0.55, 0.10]), None)
+    contact_planner = PushContactPlanner(ContactPlannerConfig(), model)
+    return PushingLoop(Simulation(seed=seed), planner, contact_planner, lambda now: target)
