@@ -94,16 +94,12 @@ class OptimalBasis:
         if s.ndim != 1 or not np.all((s >= 0.0) & (s <= 1.0)):
             raise InvalidInputError("phases to evaluate must lie in [0, 1]")
         segment, u = locate(self, s)
-        h = np.diff(self.knots)[segment]
-        position = np.eye(self.n_via + 2, self.n_via + 4)
-        weights = _hermite_weights(u, h, order)
-        terms = (
-            position[segment],
-            position[segment + 1],
-            self.knot_slopes[segment],
-            self.knot_slopes[segment + 1],
-        )
-        return np.einsum("tk,tkp->kp", np.stack(weights), np.stack(terms))
+        left, right, out, back = _hermite_weights(u, np.diff(self.knots)[segment], order)
+        phi = out[:, None] * self.knot_slopes[segment] + back[:, None] * self.knot_slopes[segment + 1]
+        row = np.arange(s.size)
+        phi[row, segment] += left
+        phi[row, segment + 1] += right
+        return phi
 
     def gramian(self) -> NDArray[np.float64]:
         """The effort as a quadratic form: G (N + 4, N + 4) with integral of q''(s)^2 ds = w^T G w.
