@@ -284,7 +284,7 @@ def test_push_box_from_the_command_line(tmp_path, capsys):
     arguments = ["experiment", "push_box", "--runs", "2", "--seed", "2", "--jobs", "1", *only]
     assert cli.main([*arguments, "--out", str(tmp_path / "out")]) == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "summary.json", "table.md", "times.png", "paths.png",
+        "summary.json", "table.md", "times.png", "paths.png", "finished_runs",
     }  # fmt: skip
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["experiment"], summary["seed"]) == ("push_box", 2)

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
 from sim_bridge.bench.measuring import Action, Cores, Row
+from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS
 from vpsto_ros.collision.arm import ArmCollision
+from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel, rollout
 from vpsto_ros.optimization.cma import make_strategy
+from vpsto_ros.optimization.costs import JointSpaceProblem
+from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import forward_kinematics_batch, fr3_pusher
 from vpsto_ros.trajectory import Limits, OptimalBasis, synthesize, synthesize_batch
+from vpsto_ros.trajectory.key_timing import time_key_positions
 
 DOF = (2, 4, 7, 14)
 BATCHES = (64, 256, 1000)
@@ -65,18 +72,19 @@ def evaluation(orders: int, cores: Cores) -> Action:
     return cores.shared(lambda part: [trajectory(times[part], order) for order in range(orders)], 1000)
 
 
-def search_step(strategy: str, dimension: int, _cores: Cores) -> Action:
-    """One ask and one tell; random costs, so that the distribution neither collapses nor runs away."""
+def search_step(name: str, dimension: int, _cores: Cores) -> Action:
+    """One ask and one tell, with random costs; a new search after 200, before the distribution degenerates."""
     rng = np.random.default_rng(0)
-    search = make_strategy(strategy, dimension, POPULATION, rng)
-    costs = rng.standard_normal((64, POPULATION))
-    turn = iter(range(10**9))
+    costs = itertools.cycle(rng.standard_normal((200, POPULATION)))
 
-    def step() -> None:
-        search.sigma = 1.0
-        search.tell(search.ask(), costs[next(turn) % len(costs)])
+    def steps() -> Iterator[None]:
+        while True:
+            strategy = make_strategy(name, dimension, POPULATION, rng)
+            for _ in range(200):
+                strategy.tell(strategy.ask(), next(costs))
+                yield
 
-    return step
+    return steps().__next__
 
 
 def vpsto_iteration(cores: Cores) -> Action:
@@ -89,7 +97,7 @@ def vpsto_iteration(cores: Cores) -> Action:
     prior = smoothness_prior(basis, start, rest, None, rest, 2.0, scale=0.1)
     direct = start + np.linspace(0.25, 1.0, 4)[:, None] * (end - start)
     shift = direct - prior.to_points(np.zeros((1, prior.dimension)))
-    search = make_strategy("sep-cma", prior.dimension, 64, np.random.default_rng(0))
+    strategy = make_strategy("sep-cma", prior.dimension, 64, np.random.default_rng(0))
     model = PushingModel(PlanarShape.box(0.12, 0.12), PlanarShape.disc(0.015))
     box, goal = np.array([0.47, 0.0, 0.0]), np.array([0.6, 0.05])
     cost = np.empty(64)
@@ -103,10 +111,10 @@ def vpsto_iteration(cores: Cores) -> Action:
     evaluate_all = cores.shared(evaluate, 64)
 
     def iterate() -> None:
-        samples = search.ask()
+        samples = strategy.ask()
         keys[:, 1:] = shift + prior.to_points(samples)
         evaluate_all()
-        search.tell(samples, cost)
+        strategy.tell(samples, cost)
 
     return iterate
 
@@ -134,6 +142,49 @@ def posture_checks(cores: Cores) -> Action:
     return cores.shared(lambda part: checker.in_collision(postures[part]), POSTURES)
 
 
+def arm_paths(cores: Cores) -> Action:
+    """64 motions of the arm checked against the same obstacles, valid ones at every instant."""
+    checker, basis, rest = ArmCollision(obstacles=cell()), OptimalBasis.uniform(3), np.zeros(7)
+    term, limits = ArmPathCost(checker), fr3_pusher().limits
+    middle = np.mean(limits.position_range, axis=0)
+    keys = middle + np.cumsum(np.random.default_rng(0).uniform(-0.2, 0.2, (64, 5, 7)), axis=1)
+    batches = [
+        synthesize_batch(basis, part, rest, rest, limits, 50, derivatives=False)
+        for part in np.array_split(keys, cores.count)
+    ]
+    return cores.shared(lambda part: [term(batch) for batch in batches[part]], cores.count)
+
+
+def planar_paths(cores: Cores) -> Action:
+    """64 paths of a point checked against the three polygons of Fig. 4.4 at every instant."""
+    basis, rest = OptimalBasis.uniform(3), np.zeros(2)
+    keys = np.random.default_rng(0).uniform(0.05, 0.45, (64, 5, 2))
+    batches = [
+        synthesize_batch(basis, part, rest, rest, LIMITS, 50) for part in np.array_split(keys, cores.count)
+    ]
+    return cores.shared(lambda part: [CLUTTER.time_in_collision(b) for b in batches[part]], cores.count)
+
+
+def clutter_solve(_cores: Cores) -> Action:
+    """A whole search through these polygons: 3 via-points, population 25, at most 200 iterations."""
+    start = STARTS["start_0.10_0.20"]
+    problem = JointSpaceProblem(OptimalBasis.uniform(3), LIMITS, start, GOAL, terms=(CLUTTER.term(),))
+    prior, config = problem.prior(), VpstoConfig(population=25, iterations=200)
+    seeds = itertools.count()
+
+    def solve() -> None:
+        search(prior, problem.evaluate, config, np.random.default_rng(next(seeds)))
+
+    return solve
+
+
+def key_timing(_cores: Cores) -> Action:
+    """Optimal timing of 4 given via-points of 7 joints."""
+    keys = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 7))
+    limits = fr3_pusher().limits
+    return lambda: time_key_positions(keys, limits)
+
+
 def checks_per_second(seconds: float) -> dict[str, float]:
     """The rate that :func:`posture_checks` stands for."""
     return {"checks_per_s": POSTURES / seconds}
@@ -150,4 +201,8 @@ ROWS = (
     *(Row(f"cma_d{d}_m{POPULATION}", partial(search_step, "cma", d)) for d in DIMENSIONS),
     Row("vpsto_iteration_b64_n7_box", vpsto_iteration),
     Row("posture_checks", posture_checks, derived=checks_per_second),
+    Row("arm_paths_b64", arm_paths),
+    Row("planar_paths_b64", planar_paths),
+    Row("solve_clutter_2d", clutter_solve),
+    Row("key_timing_n7_via4", key_timing),
 )
