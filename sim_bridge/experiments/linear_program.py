@@ -51,17 +51,18 @@ def optimal_duration(
     Raises:
         InvalidInputError: if shapes do not fit, a limit is infinite or there is no via-point.
     """
-    ends = np.array([start, goal], dtype=np.float64)
-    if ends.shape != (2, limits.dof) or not np.isfinite(ends).all():
-        raise InvalidInputError(f"start and goal must be finite with shape ({limits.dof},), got {ends.shape}")
+    first, last = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
+    for name, end in (("start", first), ("goal", last)):
+        if end.shape != (limits.dof,) or not np.isfinite(end).all():
+            raise InvalidInputError(f"{name} must be finite with shape ({limits.dof},), got {end}")
     if not (np.isfinite(limits.velocity).all() and np.isfinite(limits.acceleration).all()):
         raise InvalidInputError("the linear program needs finite limits")
     if basis.n_via < 1:
         raise InvalidInputError("without via-points there is nothing to optimise")
     if not 1e-9 <= tolerance < 1.0:
         raise InvalidInputError(f"tolerance must be from 1e-9 to below 1, got {tolerance}")
-    durations, columns = np.full(limits.dof, MINIMUM_DURATION), np.repeat(ends[:1], basis.n_via, axis=0)
-    for j, step in enumerate(ends[1] - ends[0]):
+    durations, columns = np.full(limits.dof, MINIMUM_DURATION), np.tile(first, (basis.n_via, 1))
+    for j, step in enumerate(last - first):
         if step != 0.0:
             program = _Program(basis, abs(step), limits.velocity[j], limits.acceleration[j])
             durations[j], points = program.shortest(tolerance)

@@ -96,7 +96,7 @@ def time_key_positions(
             f"key positions must have shape (N + 2, {limits.dof}) with at least a start and an end, "
             f"got {keys.shape}"
         )
-    start, end = (np.zeros(limits.dof) if v is None else v for v in (start_velocity, end_velocity))
+    start, end = (np.zeros(limits.dof) if v is None else np.ravel(v) for v in (start_velocity, end_velocity))
     uniform = OptimalBasis.uniform(len(keys) - 2)
     equal = synthesize(uniform, keys, start, end, limits, start_time=start_time)
     timing = _Timing(keys, np.array([start, end], dtype=np.float64), limits, config or KeyTimingConfig())
