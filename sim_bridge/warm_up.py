@@ -87,6 +87,7 @@ def plan_in_a_cell() -> None:
 def _search(problem: JointSpaceProblem) -> Trajectory:
     config = VpstoConfig(population=4, iterations=2)
     result = search(problem.prior(), problem.evaluate, config, np.random.default_rng(0))
+    assert result.best_any_points is not None, "every candidate has a finite cost"
     return problem.trajectory(result.best_any_points)
 
 

@@ -207,6 +207,12 @@ def test_comparison_from_the_command_line(tmp_path, capsys, one_row, old_ms, arg
     assert ("FAILED: more than 1.5 times as long: only" in printed) == (status == 1)
 
 
+def test_noise_does_not_fail_but_is_named(capsys):
+    old, new = [row_entries("a", 1.0, noise=0.5)], [row_entries("a", 2.0, noise=0.5)]
+    assert bench.report_changes(old, new, 1.5) == 0
+    assert "too noisy to be judged, repeat on a quiet machine: a" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

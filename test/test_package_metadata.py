@@ -14,6 +14,9 @@ import vpsto_ros
 ROOT = Path(__file__).resolve().parents[1]
 SETUP = (ROOT / "setup.py").read_text()
 PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
+HEAVY = {
+    "rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags", "joblib", "dask", "distributed",
+}  # fmt: skip
 SCRIPTS = dict(re.findall(r'"(\w+) = ([\w.]+:\w+)"', SETUP))
 
 
@@ -80,7 +83,19 @@ def test_the_library_needs_neither_ros_nor_a_simulator():
     ).stdout.split()
     assert "vpsto_ros.trajectory" in loaded
     tops = {name.split(".")[0] for name in loaded}
-    assert tops.isdisjoint({"rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags"})
+    assert tops.isdisjoint(HEAVY)
+
+
+def requirements(extra):
+    """Names of the packages that an extra of setup.py asks for."""
+    (entries,) = re.findall(rf'"{extra}": \[(.*?)\],\n', SETUP, re.DOTALL)
+    return set(re.findall(r'"([\w-]+)', entries))
+
+
+def test_many_runs_have_what_they_need():
+    assert {"joblib", "tqdm"} <= requirements("sim"), "processes of this machine"
+    assert {"dask", "distributed"} <= requirements("cluster")
+    assert "distributed" in requirements("test"), "or the tests on a cluster would be skipped"
 
 
 def test_models_are_installed_with_the_package():

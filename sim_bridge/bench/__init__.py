@@ -27,7 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
             (ratio or None), quick (bool).
 
     Returns:
-        1 when a row takes more than `fail_above` times as long as in the file to compare with, else 0.
+        1 when a row takes more than `fail_above` times as long as in the file to compare with, beyond noise;
+        else 0.
 
     Raises:
         InvalidInputError: when no row has such a name.
@@ -84,12 +85,19 @@ def line(row: dict[str, Any]) -> str:
 def report_changes(
     old: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]], fail_above: float | None
 ) -> int:
-    """Print what became faster or slower; 1 when a row became slower by more than is allowed."""
+    """Print what became faster or slower; 1 when a row became slower by more than is allowed.
+
+    A ratio that may be noise does not fail; that it cannot be judged is said.
+    """
     changes = compare(old, new)
     print(f"\n{comparison_table(changes, old, new)}", end="")
     if fail_above is None:
         return 0
-    worse = [change["name"] for change in changes if change["ratio"] > fail_above]
+    above = [change for change in changes if change["ratio"] > fail_above]
+    worse = [change["name"] for change in above if change["verdict"] == "slower"]
+    unclear = [change["name"] for change in above if change["verdict"] != "slower"]
+    if unclear:
+        print(f"too noisy to be judged, repeat on a quiet machine: {', '.join(unclear)}")
     verdict = f"FAILED: more than {fail_above:g} times as long: {', '.join(worse)}" if worse else "passed"
     print(f"verdict: {verdict}")
     return 1 if worse else 0

@@ -73,7 +73,7 @@ def evaluation(orders: int, cores: Cores) -> Action:
 
 
 def search_step(name: str, dimension: int, _cores: Cores) -> Action:
-    """One ask and one tell, with random costs; a new search after 200, before the distribution degenerates."""
+    """One ask and one tell with random costs; a new search after 200, before the distribution collapses."""
     rng = np.random.default_rng(0)
     costs = itertools.cycle(rng.standard_normal((200, POPULATION)))
 
