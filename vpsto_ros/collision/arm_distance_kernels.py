@@ -22,57 +22,65 @@ def pair_count(arm, cell):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _beyond(w, v, limit):
-    """Whether two centres are farther apart than a limit."""
-    x, y, z = w[6] - v[0], w[7] - v[1], w[8] - v[2]
+def _beyond(w, x, y, z, limit):
+    """Whether the centre of a placed capsule is farther from a point than a limit."""
+    x, y, z = w[6] - x, w[7] - y, w[8] - z
     return limit > 0.0 and x * x + y * y + z * z > limit * limit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def pair_distance(arm, cell, world, n, cutoff):
-    """Signed distance of pair n [m]; infinite if balls around the two already show that it exceeds cutoff."""
-    planes = cell.plane_pairs.shape[0]
-    if n < planes:
-        k = cell.plane_pairs[n, 0]
-        return capsule_plane_distance(world[k], arm.radius[k], cell.planes[cell.plane_pairs[n, 1]])
-    n -= planes
-    boxes = cell.box_pairs.shape[0]
-    if n < boxes:
-        k, i = cell.box_pairs[n, 0], cell.box_pairs[n, 1]
+def pair_distances(arm, cell, world, cutoff, falling, out):
+    """Fill the signed distances (pairs,) [m] of placed capsules.
+
+    Where balls around the two already show that a distance exceeds the cutoff, it is infinite. If the cutoff
+    is falling it follows the least distance so far.
+    """
+    n = 0
+    for m in range(cell.plane_pairs.shape[0]):
+        k = cell.plane_pairs[m, 0]
+        out[n] = capsule_plane_distance(world[k], arm.radius[k], cell.planes[cell.plane_pairs[m, 1]])
+        cutoff = min(cutoff, out[n]) if falling else cutoff
+        n += 1
+    for m in range(cell.box_pairs.shape[0]):
+        k, i = cell.box_pairs[m, 0], cell.box_pairs[m, 1]
+        w, box = world[k], cell.boxes[i]
         outer = arm.radius[k] + arm.half_length[k] + cell.box_bound[i]
-        if _beyond(world[k], cell.boxes[i], outer + cutoff):
-            return np.inf
-        return capsule_box_distance(world[k], arm.radius[k], cell.boxes[i])
-    n -= boxes
-    capsules = cell.capsule_pairs.shape[0]
-    if n < capsules:
-        k, i = cell.capsule_pairs[n, 0], cell.capsule_pairs[n, 1]
-        v = cell.capsules[i]
-        outer = arm.radius[k] + arm.half_length[k] + v[9] + v[10]
-        if _beyond(world[k], v[6:9], outer + cutoff):
-            return np.inf
-        return capsule_capsule_distance(world[k], v, arm.radius[k] + v[9])
-    n -= capsules
-    k, i = arm.pairs[n, 0], arm.pairs[n, 1]
-    radii = arm.radius[k] + arm.radius[i]
-    if _beyond(world[k], world[i, 6:9], radii + arm.half_length[k] + arm.half_length[i] + cutoff):
-        return np.inf
-    return capsule_capsule_distance(world[k], world[i], radii)
+        out[n] = np.inf
+        if not _beyond(w, box[0], box[1], box[2], outer + cutoff):
+            out[n] = capsule_box_distance(w, arm.radius[k], box)
+        cutoff = min(cutoff, out[n]) if falling else cutoff
+        n += 1
+    for m in range(cell.capsule_pairs.shape[0]):
+        k, i = cell.capsule_pairs[m, 0], cell.capsule_pairs[m, 1]
+        w, v = world[k], cell.capsules[i]
+        outer = arm.radius[k] + arm.half_length[k] + v[6] + v[7]
+        out[n] = np.inf
+        if not _beyond(w, v[0] + 0.5 * v[3], v[1] + 0.5 * v[4], v[2] + 0.5 * v[5], outer + cutoff):
+            out[n] = capsule_capsule_distance(w, v, arm.radius[k] + v[6])
+        cutoff = min(cutoff, out[n]) if falling else cutoff
+        n += 1
+    for m in range(arm.pairs.shape[0]):
+        k, i = arm.pairs[m, 0], arm.pairs[m, 1]
+        w, v = world[k], world[i]
+        radii = arm.radius[k] + arm.radius[i]
+        out[n] = np.inf
+        if not _beyond(w, v[6], v[7], v[8], radii + arm.half_length[k] + arm.half_length[i] + cutoff):
+            out[n] = capsule_capsule_distance(w, v, radii)
+        cutoff = min(cutoff, out[n]) if falling else cutoff
+        n += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest(arm, cell, q, distance, pair):
     """Fill the least signed distance (M,) over all pairs and its pair (M,), -1 if there is none."""
     sine, cosine, world = workspace(arm)
+    out = np.empty(pair_count(arm, cell))
     for m in range(q.shape[0]):
         sines(q[m], sine[0], cosine[0])
         place(arm, sine[0], cosine[0], world)
-        best, which = np.inf, -1
-        for n in range(pair_count(arm, cell)):
-            value = pair_distance(arm, cell, world, n, best)
-            if value < best:
-                best, which = value, n
-        distance[m], pair[m] = best, which
+        pair_distances(arm, cell, world, np.inf, True, out)
+        pair[m] = out.argmin() if out.size else -1
+        distance[m] = out[pair[m]] if out.size else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -82,16 +90,16 @@ def every_pair(arm, cell, q, distance):
     for m in range(q.shape[0]):
         sines(q[m], sine[0], cosine[0])
         place(arm, sine[0], cosine[0], world)
-        for n in range(distance.shape[1]):
-            distance[m, n] = pair_distance(arm, cell, world, n, np.inf)
+        pair_distances(arm, cell, world, np.inf, False, distance[m])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def overlap(arm, cell, world, margin):
-    """By how much the pairs that are closer than a margin are too close, summed [m]."""
+def overlap(arm, cell, world, margin, out):
+    """By how much the pairs that are closer than a margin are too close, summed [m]; out (pairs,) is room."""
+    pair_distances(arm, cell, world, margin, False, out)
     total = 0.0
-    for n in range(pair_count(arm, cell)):
-        total += max(margin - pair_distance(arm, cell, world, n, margin), 0.0)
+    for distance in out:
+        total += max(margin - distance, 0.0)
     return total
 
 

@@ -51,7 +51,8 @@ class CellArrays(NamedTuple):
     Attributes:
         boxes: centre, rotation row by row, half sizes, shape (.., 15).
         box_bound: radius of the enclosing ball, shape (..,).
-        capsules: start, direction, centre, radius, radius of the enclosing ball, shape (.., 11).
+        capsules: start, direction, radius, half the length of the segment, 1 / length² (0 for a ball),
+            shape (.., 9).
         planes: normal and offset, shape (.., 4).
         box_pairs, capsule_pairs, plane_pairs: (capsule of the arm, obstacle), shape (.., 2).
     """
@@ -147,18 +148,35 @@ def _box_hit(w, reach, half_length, box, bound):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _capsule_hit(v, w, reach, half_lengths):
-    """Whether two rows (start, direction, centre, ..) are closer than reach: balls, then the segments."""
-    x, y, z = w[6] - v[6], w[7] - v[7], w[8] - v[8]
-    squared = x * x + y * y + z * z
-    if squared > (reach + half_lengths) ** 2:
-        return False
-    return (
-        segment_segment_squared(
-            v[0], v[1], v[2], v[3], v[4], v[5], w[0], w[1], w[2], w[3], w[4], w[5]
-        )
-        < reach * reach
+def _segments_within(v, w, reach):
+    """Whether the segments of two rows (start, direction, ..) are closer than reach."""
+    squared = segment_segment_squared(
+        v[0], v[1], v[2], v[3], v[4], v[5], w[0], w[1], w[2], w[3], w[4], w[5]
     )  # fmt: skip
+    return squared < reach * reach
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _self_hit(v, w, reach, half_lengths):
+    """Whether two placed capsules are closer than reach: balls, then the segments."""
+    x, y, z = w[6] - v[6], w[7] - v[7], w[8] - v[8]
+    near = reach + half_lengths
+    return x * x + y * y + z * z < near * near and _segments_within(v, w, reach)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _capsule_hit(w, reach, half_length, v):
+    """Whether a placed capsule meets an obstacle: its ball against the segment, then the segments.
+
+    An obstacle may be long, so that a ball around it would say little.
+    """
+    x, y, z = w[6] - v[0], w[7] - v[1], w[8] - v[2]
+    t = min(1.0, max(0.0, (x * v[3] + y * v[4] + z * v[5]) * v[8]))
+    x, y, z = x - t * v[3], y - t * v[4], z - t * v[5]
+    squared, near = x * x + y * y + z * z, reach + v[6]
+    if squared > (near + half_length) ** 2:
+        return False
+    return squared < near * near or _segments_within(v, w, near)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -183,12 +201,11 @@ def touches(arm, cell, world, reach, pair_reach):
             return True
     for n in range(cell.capsule_pairs.shape[0]):
         k, i = cell.capsule_pairs[n, 0], cell.capsule_pairs[n, 1]
-        v = cell.capsules[i]
-        if _capsule_hit(v, world[k], reach[k] + v[9], arm.half_length[k] + v[10]):
+        if _capsule_hit(world[k], reach[k], arm.half_length[k], cell.capsules[i]):
             return True
     for n in range(arm.pairs.shape[0]):
         k, i = arm.pairs[n, 0], arm.pairs[n, 1]
-        if _capsule_hit(world[k], world[i], pair_reach[n], arm.half_length[k] + arm.half_length[i]):
+        if _self_hit(world[k], world[i], pair_reach[n], arm.half_length[k] + arm.half_length[i]):
             return True
     return False
 

@@ -9,7 +9,7 @@ is within a tolerance.
 import numpy as np
 from numba import njit
 
-from vpsto_ros.collision.arm_distance_kernels import overlap
+from vpsto_ros.collision.arm_distance_kernels import overlap, pair_count
 from vpsto_ros.collision.arm_kernels import place, sines, touches, workspace
 
 _DEPTH = 40  # halvings; the tolerance ends them long before
@@ -93,7 +93,7 @@ def first_contact(arm, cell, coefficients, spans, margin, tolerance):
             middle = 0.5 * (begin + end)
             _expand(coefficients[piece], middle, 0.5 * (end - begin), q, delta)
             largest = _grow(arm, delta, margin, reach, pair_reach)
-            if largest < 0.15:  # larger motions never pass in a cell that needs checking
+            if largest < 0.3:  # a larger motion hardly ever passes
                 sines(q, sine[0], cosine[0])
                 place(arm, sine[0], cosine[0], world)
                 if not touches(arm, cell, world, reach, pair_reach):
@@ -140,6 +140,7 @@ def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, to
     sine, cosine, world = workspace(arm)
     coefficients, spans = np.empty((pieces, 6, 7)), np.empty(pieces)
     reach, pair_reach = np.empty(arm.radius.shape[0]), np.empty(arm.pairs.shape[0])
+    room = np.empty(pair_count(arm, cell))
     _grow(arm, np.zeros(7), margin, reach, pair_reach)
     for b in range(samples.shape[0]):
         cost[b] = 0.0
@@ -147,7 +148,7 @@ def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, to
             sines(samples[b, m], sine[0], cosine[0])
             place(arm, sine[0], cosine[0], world)
             if touches(arm, cell, world, reach, pair_reach):
-                cost[b] += 1.0 + overlap(arm, cell, world, margin) / depth_scale
+                cost[b] += 1.0 + overlap(arm, cell, world, margin, room) / depth_scale
         if cost[b] == 0.0:
             _hermite(knots, keys[b], slopes[b], coefficients, spans)
             if first_contact(arm, cell, coefficients, spans, proof_margin, tolerance)[0] >= 0:

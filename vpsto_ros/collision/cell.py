@@ -25,7 +25,7 @@ def cell_arrays(arm: ArmArrays, obstacles: Sequence[Shape], margin: float) -> Ce
     rods = [shape for shape in obstacles if isinstance(shape, Sphere | Capsule)]
     planes = [shape for shape in obstacles if isinstance(shape, HalfSpace)]
     box_rows = _rows([box_row(box.centre, box.rotation, box.half_size) for box in boxes], 15)
-    capsule_rows = _rows([_capsule_row(shape) for shape in rods], 11)
+    capsule_rows = _rows([_capsule_row(shape) for shape in rods], 9)
     plane_rows = _rows([np.append(plane.normal, plane.offset) for plane in planes], 4)
     bound = np.linalg.norm(box_rows[:, 12:], axis=1)
     shoulder = np.array([0.0, 0.0, arm.dh[0, 1]])
@@ -46,10 +46,11 @@ def _rows(rows: list[NDArray[np.float64]], width: int) -> NDArray[np.float64]:
 
 
 def _capsule_row(shape: Sphere | Capsule) -> NDArray[np.float64]:
-    """Start, direction, centre, radius, half the length of the segment."""
+    """Start, direction, radius, half the length of the segment, and 1 / length² or zero."""
     a, b = (shape.centre, shape.centre) if isinstance(shape, Sphere) else (shape.a, shape.b)
-    half = 0.5 * float(np.linalg.norm(b - a))
-    return np.concatenate([a, b - a, 0.5 * (a + b), [shape.radius, half]])
+    squared = float((b - a) @ (b - a))
+    tail = [shape.radius, 0.5 * np.sqrt(squared), 1.0 / squared if squared > 0.0 else 0.0]
+    return np.concatenate([a, b - a, tail])
 
 
 def _reach_of_shoulder(arm: ArmArrays) -> NDArray[np.float64]:
@@ -65,9 +66,8 @@ def _box_distance(row: NDArray[np.float64], point: NDArray[np.float64]) -> float
 
 
 def _capsule_distance(row: NDArray[np.float64], point: NDArray[np.float64]) -> float:
-    length = float(row[3:6] @ row[3:6])
-    t = np.clip((point - row[:3]) @ row[3:6] / length, 0.0, 1.0) if length > 0.0 else 0.0
-    return float(np.linalg.norm(row[:3] + t * row[3:6] - point) - row[9])
+    t = np.clip((point - row[:3]) @ row[3:6] * row[8], 0.0, 1.0)
+    return float(np.linalg.norm(row[:3] + t * row[3:6] - point) - row[6])
 
 
 def _pairs(arm: ArmArrays, reach: NDArray[np.float64], distances: list[float]) -> NDArray[np.int64]:
