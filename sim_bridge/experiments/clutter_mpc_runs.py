@@ -45,7 +45,7 @@ ALL_STARTS = {**STARTS, "open": np.array([0.25, 0.3])}
 SPEED = float(np.hypot(*LIMITS.velocity))
 """Greatest speed of the robot [m/s]."""
 
-MPPI_MARGIN = 0.005
+MPPI_MARGIN = 0.003
 """What the baseline keeps away from obstacles [m]: it looks at points up to 7 mm apart, not in between."""
 
 
