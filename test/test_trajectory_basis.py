@@ -117,5 +117,7 @@ def test_refuses_bad_arguments():
             basis(s)
     with pytest.raises(InvalidInputError, match="order"):
         basis(0.5, 4)
-    with pytest.raises(InvalidInputError, match="n_via"):
-        OptimalBasis.uniform(-1)
+    for n_via in (-1, 2.0, 2.5, True, None, "3"):
+        with pytest.raises(InvalidInputError, match="n_via"):
+            OptimalBasis.uniform(n_via)
+    assert OptimalBasis.uniform(np.int64(3)).n_via == 3

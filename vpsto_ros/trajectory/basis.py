@@ -61,15 +61,15 @@ class OptimalBasis:
             object.__setattr__(self, name, array)
 
     @staticmethod
-    @functools.lru_cache(maxsize=256)
+    @functools.lru_cache(maxsize=256, typed=True)
     def uniform(n_via: int) -> "OptimalBasis":
         """The basis with N via-points equally spaced in phase; N = 0 joins start and end directly.
 
         Raises:
-            InvalidInputError: if n_via is negative.
+            InvalidInputError: if n_via is negative or not a whole number.
         """
-        if n_via < 0:
-            raise InvalidInputError(f"n_via must be 0 or more, got {n_via}")
+        if isinstance(n_via, bool) or not isinstance(n_via, int | np.integer) or n_via < 0:
+            raise InvalidInputError(f"n_via must be a whole number, 0 or more, got {n_via!r}")
         return OptimalBasis(np.arange(1, n_via + 2) / (n_via + 1))
 
     @property
