@@ -275,6 +275,19 @@ def test_refuses_bad_key_positions(keys):
         time_key_positions(keys, box(2))
 
 
+def test_refuses_ragged_rows_bad_generators_and_bad_times():
+    keys = [[0.0, 0.0], [0.5, 0.1], [1.0, 1.0]]
+    for bad in ([[0.0, 0.0], [1.0]], [["a", "b"], [0.0, 1.0]], None):
+        with pytest.raises(InvalidInputError, match="key positions"):
+            time_key_positions(bad, box(2))
+    with pytest.raises(InvalidInputError, match="rng"):
+        time_key_positions(keys, box(2), rng=3)
+    with pytest.raises(InvalidInputError, match="start_time"):
+        time_key_positions(keys, box(2), start_time=np.nan)
+    with pytest.raises(InvalidInputError, match="key positions"):
+        time_key_positions(keys, box(3))
+
+
 @pytest.mark.parametrize("velocity", [[0.0], [0.0, np.nan], np.zeros((2, 2)), 0.0, np.zeros(3)])
 def test_refuses_bad_boundary_velocities(velocity):
     keys = [[0.0, 0.0], [0.5, 0.1], [1.0, 1.0]]

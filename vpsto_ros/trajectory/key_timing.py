@@ -90,12 +90,9 @@ def time_key_positions(
         InvalidInputError: if shapes do not fit or an entry is not finite.
         InfeasibleError: if a boundary velocity is beyond its limit.
     """
-    keys = np.array(key_positions, dtype=np.float64)
-    if keys.ndim != 2 or len(keys) < 2:
-        raise InvalidInputError(
-            f"key positions must have shape (N + 2, {limits.dof}) with at least a start and an end, "
-            f"got {keys.shape}"
-        )
+    keys = _matrix(key_positions, limits.dof)
+    if rng is not None and not isinstance(rng, np.random.Generator):
+        raise InvalidInputError(f"rng must be a numpy.random.Generator, got {rng!r}")
     start, end = (np.zeros(limits.dof) if v is None else np.ravel(v) for v in (start_velocity, end_velocity))
     uniform = OptimalBasis.uniform(len(keys) - 2)
     equal = synthesize(uniform, keys, start, end, limits, start_time=start_time)
@@ -106,6 +103,17 @@ def time_key_positions(
         return TimedKeys(uniform.phases, equal.duration, equal.duration, equal)
     best = timing.trajectory(timing.basis, timing.duration, start_time)
     return TimedKeys(timing.basis.phases, best.duration, equal.duration, best)
+
+
+def _matrix(key_positions: ArrayLike, dof: int) -> NDArray[np.float64]:
+    expected = f"key positions must be numbers of shape (N + 2, {dof}), at least a start and an end"
+    try:
+        keys = np.array(key_positions, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"{expected}: {error}") from error
+    if keys.ndim != 2 or len(keys) < 2:
+        raise InvalidInputError(f"{expected}; got {keys.shape}")
+    return keys
 
 
 class _Timing:

@@ -45,6 +45,8 @@ def synthesize(
         raise InfeasibleError(_beyond_limit(start_velocity, end_velocity, limits))
     if duration is not None and not (np.isfinite(duration) and duration > 0.0):
         raise InvalidInputError(f"duration must be positive and finite, got {duration}")
+    if not np.isfinite(start_time):
+        raise InvalidInputError(f"start_time must be finite, got {start_time}")
     total = shortest if duration is None else float(duration)
     ends = np.array([start_velocity, end_velocity], dtype=np.float64)
     by_keys, by_velocity = basis.knot_slopes[:, :-2], basis.knot_slopes[:, -2:]
