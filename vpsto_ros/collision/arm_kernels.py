@@ -184,7 +184,8 @@ def touches(arm, cell, world, reach, pair_reach):
     """Whether any pair is closer than allowed.
 
     Args:
-        arm, cell: geometry.
+        arm: the arm.
+        cell: its surroundings.
         world: placed capsules (C, 9).
         reach: radius of every capsule against obstacles, shape (C,).
         pair_reach: smallest distance of the segments of every self-collision pair, shape (S,).

@@ -75,7 +75,8 @@ def first_contact(arm, cell, coefficients, spans, margin, tolerance):
     """Where a motion may be closer than the margin: (piece, start, end of the interval); piece -1 if nowhere.
 
     Args:
-        arm, cell: geometry; the pairs of the cell must hold for margin + tolerance and more.
+        arm: the arm.
+        cell: its surroundings; pairs that it leaves out must never be closer than the margin.
         coefficients: powers of the time since the start of each piece, shape (S, 6, 7).
         spans: lengths of the pieces, shape (S,).
         margin: distance to keep [m].
@@ -126,14 +127,17 @@ def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, to
     """Fill the collision cost (B,) of a batch; zero exactly where a motion is proven free.
 
     Args:
-        arm, cell: geometry; the pairs of the cell must hold for the margins.
+        arm: the arm.
+        cell: its surroundings; pairs that it leaves out must never be closer than the margins.
         samples: positions (B, K, 7).
-        knots, keys, slopes: of the cubics, shapes (N + 2,), (B, N + 2, 7) and (B, N + 2, 7).
+        knots: phases between the cubics, shape (N + 2,).
+        keys: positions there, shape (B, N + 2, 7).
+        slopes: derivatives there with respect to phase, shape (B, N + 2, 7).
         margin: a sample that comes closer counts [m].
         proof_margin: what is proven of the motions without such a sample [m].
         tolerance: of the proof [m].
         depth_scale: overlap that counts as much as the sample itself [m].
-        cost: share of the samples in collision, each weighted by 1 + overlap / depth_scale.
+        cost: filled with the share of the samples in collision, each weighted by 1 + overlap / depth_scale.
     """
     count = samples.shape[1]
     pieces = knots.shape[0] - 1

@@ -54,7 +54,7 @@ def _capsule_row(shape: Sphere | Capsule) -> NDArray[np.float64]:
 
 
 def _reach_of_shoulder(arm: ArmArrays) -> NDArray[np.float64]:
-    """Largest distance (C,) of each segment's points from the shoulder, where the axes of joints 1, 2 meet."""
+    """Largest distance (C,) of each segment's points from the shoulder, where joints 1 and 2 meet."""
     ends = np.stack([arm.local[:, :3], arm.local[:, :3] + arm.local[:, 3:]])
     own = np.linalg.norm(ends, axis=-1).max(axis=0)
     return np.where(arm.link <= 2, own, arm.swing[:, 1])

@@ -126,7 +126,7 @@ def into_frame(box, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def capsule_box_distance(segment, radius, box):
-    """Signed distance of a capsule, segment = (start, direction) (6,), from a box (15,): centre, rotation, h."""
+    """Signed distance of a capsule with segment (start, direction) from a box (centre, rotation, h)."""
     px, py, pz = into_frame(box, segment[0] - box[0], segment[1] - box[1], segment[2] - box[2])
     dx, dy, dz = into_frame(box, segment[3], segment[4], segment[5])
     return segment_box(px, py, pz, dx, dy, dz, box[12], box[13], box[14]) - radius
@@ -144,7 +144,7 @@ def capsule_capsule_distance(first, second, radii):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def capsule_plane_distance(segment, radius, plane):
-    """Signed distance of a capsule (start, direction) from the half-space normal · p <= offset, plane (4,)."""
+    """Signed distance of a capsule from the half-space normal · p <= offset, plane = (normal, offset)."""
     start = plane[0] * segment[0] + plane[1] * segment[1] + plane[2] * segment[2]
     along = plane[0] * segment[3] + plane[1] * segment[4] + plane[2] * segment[5]
     return start + min(along, 0.0) - plane[3] - radius

@@ -34,12 +34,19 @@ class ReachConfig:
 
     guesses: int = option(100, "motions through a random posture that are looked at in a round", minimum=0)
     near: float = option(
-        0.5, "share of the postures drawn near the straight line instead of anywhere", minimum=0.0, maximum=1.0
+        0.5,
+        "share of the postures drawn near the straight line instead of anywhere",
+        minimum=0.0,
+        maximum=1.0,
     )
-    near_spread: float = option(0.7, "their standard deviation about it, in the unit of the joints", minimum=0.0)
+    near_spread: float = option(
+        0.7, "their standard deviation about it, in the unit of the joints", minimum=0.0
+    )
     rounds: int = option(100, "rounds at most", minimum=1, maximum=100_000)
     valid_rounds: int = option(2, "rounds with a valid motion after which the best one will do", minimum=1)
-    spread: float = option(0.6, "standard deviation of the via-points, in the unit of the joints", minimum=1e-9)
+    spread: float = option(
+        0.6, "standard deviation of the via-points, in the unit of the joints", minimum=1e-9
+    )
     search: VpstoConfig = dataclasses.field(
         default_factory=lambda: VpstoConfig(population=24, starts=4, iterations=40, restarts=0)
     )
@@ -97,7 +104,9 @@ def plan_reach(
         if best is not None and deadline is not None and clock() >= deadline:
             break
         means = np.concatenate([prior.mean_points[None], guesses(problem, in_collision, config, rng)])
-        found = search(prior, problem.evaluate, config.search, rng, means=means, deadline=deadline, clock=clock)
+        found = search(
+            prior, problem.evaluate, config.search, rng, means=means, deadline=deadline, clock=clock
+        )
         rounds, evaluations = rounds + 1, evaluations + found.evaluations
         valid_rounds += found.valid
         if found.valid and first_valid is None:
@@ -141,7 +150,9 @@ def through(problem: JointSpaceProblem, postures: NDArray[np.float64]) -> NDArra
     return batch.position[:, 1:-1]
 
 
-def _near_line(problem: JointSpaceProblem, config: ReachConfig, rng: np.random.Generator, size: int) -> NDArray:
+def _near_line(
+    problem: JointSpaceProblem, config: ReachConfig, rng: np.random.Generator, size: int
+) -> NDArray:
     assert problem.goal is not None
     along = rng.uniform(0.0, 1.0, (size, 1))
     line = problem.start + along * (problem.goal - problem.start)
