@@ -9,14 +9,9 @@ import pytest
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError, VpstoError
 from vpsto_ros.optimization.costs import CostWeights
 from vpsto_ros.optimization.vpsto import VpstoConfig
-from vpsto_ros.planning.joint_space import (
-    JointSpaceMpc,
-    JointSpaceMpcConfig,
-    OnlineJointSpaceProblem,
-    as_batch,
-    remainder,
-)
+from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig, OnlineJointSpaceProblem
 from vpsto_ros.planning.mpc import OnlineConfig
+from vpsto_ros.planning.stitching import as_batch, remainder
 from vpsto_ros.planning.table_path import extended
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize, synthesize_batch
 
@@ -148,7 +143,8 @@ def test_the_present_plan_is_kept_when_the_search_finds_nothing():
 def test_after_a_step_without_a_plan_the_next_one_explores():
     mpc = planner()
     mpc.accept(mpc.step(PERIOD, GOAL, (reject,)))
-    assert mpc.step(2 * PERIOD, GOAL, (IN_THE_WAY,)).searched == "explore"
+    plan = mpc.step(2 * PERIOD, GOAL, (IN_THE_WAY,))
+    assert plan.searched == "explore" and mpc.explain(plan) == []
 
 
 def test_brakes_before_a_wall_that_appears():
@@ -187,11 +183,27 @@ def test_gets_out_of_the_way_of_a_ball_that_comes_to_a_standing_robot():
 
 
 def test_an_unreachable_goal_is_reported_and_the_robot_stays():
-    shell = Ball(GOAL, 0.3)
-    motion, plans = drive(planner(), lambda t: (shell,), steps=6)
+    shell, mpc = Ball(GOAL, 0.3), planner()
+    motion, plans = drive(mpc, lambda t: (shell,), steps=6)
+    (reason,) = mpc.explain(plans[-1])
+    assert "Ball is not satisfied" in reason
     assert all(plan.mode == "follow" and not plan.valid and plan.cost == math.inf for plan in plans)
     assert all(plan.search.status == "no valid plan" for plan in plans)
     np.testing.assert_allclose(motion.extrema(0), np.stack([START, START]), atol=1e-12)
+
+
+def test_a_start_in_collision_is_no_error_in_a_control_loop():
+    class Explained(Ball):
+        """An obstacle that says what is wrong, as the library's do."""
+
+        def explain(self, trajectory):
+            return ["inside the ball"]
+
+    mpc = planner()
+    plan = mpc.step(PERIOD, GOAL, (Explained(START, 0.05),))
+    assert not plan.valid and mpc.explain(plan) == ["inside the ball"]
+    away = plan.trajectory(plan.trajectory.end_time) - START
+    assert plan.mode != "escape" or np.linalg.norm(away) > 0.05
 
 
 def test_where_nothing_is_clear_the_least_bad_motion_still_keeps_the_limits():

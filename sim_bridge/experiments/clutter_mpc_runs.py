@@ -23,7 +23,8 @@ from sim_bridge.experiments.clutter_mpc_discs import (
 from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
 from sim_bridge.experiments.mppi import Mppi, MppiConfig, grown
 from vpsto_ros.collision.planar import MovingDisc
-from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig, remainder
+from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig
+from vpsto_ros.planning.stitching import remainder
 from vpsto_ros.planning.table_path import extended
 from vpsto_ros.trajectory import Trajectory
 

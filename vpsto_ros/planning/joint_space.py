@@ -18,14 +18,13 @@ from vpsto_ros.exceptions import InvalidInputError, VpstoError
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem, Term
 from vpsto_ros.optimization.vpsto import Evaluation, SearchResult, VpstoConfig
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineVpsto
-from vpsto_ros.planning.table_path import extended, resting
+from vpsto_ros.planning.stitching import as_batch, remainder
+from vpsto_ros.planning.table_path import extended
 from vpsto_ros.priors.smoothness import GaussianPrior
 from vpsto_ros.trajectory import (
-    MINIMUM_DURATION,
     Limits,
     OptimalBasis,
     Trajectory,
-    TrajectoryBatch,
     braking_trajectory,
     synthesize,
     synthesize_batch,
@@ -184,6 +183,7 @@ class JointSpaceMpc:
         self.online = OnlineVpsto(config.online, rng)
         self._reference: Trajectory | None = None
         self._solved = False
+        self._posed: OnlineJointSpaceProblem | None = None
 
     @property
     def reference(self) -> Trajectory:
@@ -242,7 +242,7 @@ class JointSpaceMpc:
             VpstoError: nothing is being executed yet.
         """
         kept, goal = remainder(self.reference, takeover), self._checked(goal)
-        problem = self._problem(kept, goal, terms)
+        problem = self._posed = self._problem(kept, goal, terms)
         judge = problem if tolerated is None else self._problem(kept, goal, tolerated)
         cost, clear = judge.assess(kept)
         arrives = clear and bool(np.abs(kept(kept.end_time) - goal).max() <= AT_GOAL)
@@ -258,6 +258,13 @@ class JointSpaceMpc:
             return JointSpacePlan(kept, "keep", result.mode, True, cost, result.search)
         mode, motion = self._fallback(judge, kept)
         return JointSpacePlan(motion, mode, result.mode, False, math.inf, result.search)
+
+    def explain(self, plan: JointSpacePlan) -> list[str]:
+        """Why the search of the last step found no valid plan: what breaks its best candidate, in words."""
+        best = None if plan.search is None or plan.search.valid else plan.search.best_any_points
+        if best is None or self._posed is None:
+            return []
+        return self._posed.plain(len(best)).explain(best)
 
     def _checked(self, goal: ArrayLike) -> NDArray:
         """The goal, refused if no motion could end there."""
@@ -321,33 +328,3 @@ class JointSpaceMpc:
             synthesize(basis, keys[i], judge.velocity, still, limits, start_time=judge.start_time)
             for i in order[:MOST_ESCAPES]
         ]
-
-
-def remainder(trajectory: Trajectory, start: float) -> Trajectory:
-    """What is left of a motion from `start` [s] on; when it is over, a moment at its last position."""
-    if abs(start - trajectory.start_time) < 1e-9:  # a knot there would leave a sliver that stands still
-        return trajectory
-    if start < trajectory.end_time - 1e-9:
-        return trajectory.clipped(start, trajectory.end_time)
-    return resting(trajectory(trajectory.end_time), start, start + MINIMUM_DURATION)
-
-
-def as_batch(trajectory: Trajectory, samples: int) -> TrajectoryBatch:
-    """One trajectory as a batch of one, so that cost terms can look at a motion that no candidate stands for.
-
-    Args:
-        trajectory: piecewise cubic; knots may be anywhere.
-        samples: number K of equally spaced phases.
-
-    Raises:
-        InvalidInputError: the trajectory is not piecewise cubic.
-    """
-    if trajectory.coefficients[:, 4:].any():
-        raise InvalidInputError("only a piecewise cubic trajectory can be written as a batch")
-    start, duration = trajectory.start_time, trajectory.duration
-    times = start + np.linspace(0.0, duration, samples)
-    knots = (trajectory.times - start) / duration
-    return TrajectoryBatch(
-        np.array([duration]), trajectory(times)[None], trajectory(times, 1)[None], trajectory(times, 2)[None],
-        trajectory(trajectory.times)[None], knots, duration * trajectory(trajectory.times, 1)[None],
-    )  # fmt: skip
