@@ -85,7 +85,9 @@ def test_noise_is_what_parts_of_the_measurement_differ_by():
     steady = [[1.0, 1.1, 1.0] * 8] * 3
     assert statistics(row, 1, steady)["noise"] == pytest.approx(0.0)
     drifting = [[1.0] * 24, [1.2] * 24, [1.4] * 24]
-    assert statistics(row, 1, drifting)["noise"] == pytest.approx(np.std([1.0, 1.2, 1.4]) / 1.2)
+    assert statistics(row, 1, drifting)["noise"] == pytest.approx(1.4826 * 0.2 / 1.2)
+    disturbed = [[1.0, 1.1, 1.0] * 8, [1.0, 1.1, 1.0] * 8, [9.0] * 6 + [1.0] * 18]
+    assert statistics(row, 1, disturbed)["noise"] == pytest.approx(0.0), "one part of twelve"
 
 
 def test_a_row_derives_further_figures_from_its_median():

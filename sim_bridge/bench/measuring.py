@@ -117,9 +117,10 @@ def durations(action: Action, calls: int, own_times: bool = False) -> list[float
 def statistics(row: Row, cores: int, passes: Sequence[Sequence[float]]) -> dict[str, Any]:
     """The entries of a row.
 
-    `noise` is the standard deviation of the median over parts of the measurement, relative to the median:
-    what a second measurement of the same code may well differ by. `mean_ms` leaves the slowest percent out,
-    which is when other processes had the core.
+    `noise` is the scatter of the median over parts of the measurement, relative to the median: the median
+    absolute deviation, scaled to the standard deviation of a normal distribution. Like the median itself, it
+    does not mind a few parts during which other processes had the core. `mean_ms` leaves the slowest percent
+    out for the same reason.
 
     Args:
         row: what was measured.
@@ -128,6 +129,8 @@ def statistics(row: Row, cores: int, passes: Sequence[Sequence[float]]) -> dict[
     """
     seconds = np.concatenate([np.asarray(durations, dtype=float) for durations in passes])
     blocks = [block for durations in passes for block in np.array_split(durations, BLOCKS) if block.size]
+    medians = [np.median(block) for block in blocks]
+    scatter = 1.4826 * np.median(np.abs(medians - np.median(medians)))
     p50, p99 = np.percentile(seconds, (50, 99))
     mean = seconds[seconds <= p99].mean()
     entries: dict[str, Any] = {
@@ -137,7 +140,7 @@ def statistics(row: Row, cores: int, passes: Sequence[Sequence[float]]) -> dict[
         "p99_ms": 1e3 * float(p99),
         "max_ms": 1e3 * float(seconds.max()),
         "mean_ms": 1e3 * float(mean),
-        "noise": float(np.std([np.median(block) for block in blocks]) / p50),
+        "noise": float(scatter / p50),
     }
     return entries | (row.derived(float(p50)) if row.derived else {})
 
