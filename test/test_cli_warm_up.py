@@ -43,7 +43,7 @@ def warmed():
     assert cli.main(["warm-up"]) == 0
 
 
-@pytest.mark.parametrize("name", modules_with_kernels())
+@pytest.mark.parametrize("name", list(modules_with_kernels()))
 def test_every_kernel_is_there_after_the_warm_up(warmed, name):
     missing = {kernel.__qualname__ for kernel in kernels_called_from_python(name) if not kernel.signatures}
     assert not missing
