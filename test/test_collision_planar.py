@@ -42,6 +42,12 @@ def winding(polygon, points):
     return np.abs(angles.sum(axis=1)) > np.pi
 
 
+def share_in_collision(world, batch, start_time=0.0):
+    """Share of the duration, which is what samples at equal steps of phase count, and validity."""
+    seconds, valid = world.time_in_collision(batch, start_time)
+    return seconds / batch.duration, valid
+
+
 def random_cubics(seed, count, reach=2.0, pieces=2):
     rng = np.random.default_rng(seed)
     keys = rng.uniform(-reach, reach, (count, pieces + 1, 2))
@@ -58,7 +64,7 @@ def straight(start, end):
 def test_share_agrees_with_dense_sampling(polygon):
     batch = random_cubics(1, 12)
     s = (np.arange(100_000) + 0.5) / 100_000
-    share, valid = PlanarWorld(**FREE, polygons=(polygon,)).time_in_collision(batch)
+    share, valid = share_in_collision(PlanarWorld(**FREE, polygons=(polygon,)), batch)
     sampled = [winding(polygon, hermite(batch, row, s)).mean() for row in range(12)]
     np.testing.assert_allclose(share, sampled, atol=1e-4)
     assert (np.array(sampled) > 0).any()
@@ -67,7 +73,7 @@ def test_share_agrees_with_dense_sampling(polygon):
 
 def test_share_agrees_with_numpy_roots_to_round_off():
     batch = random_cubics(2, 60, pieces=1)
-    share, _ = PlanarWorld(**FREE, polygons=(STAR,)).time_in_collision(batch)
+    share, _ = share_in_collision(PlanarWorld(**FREE, polygons=(STAR,)), batch)
     u = np.linspace(0.0, 1.0, 4)
     for row in range(60):
         power = np.polyfit(u, hermite(batch, row, u), 3).T
@@ -82,8 +88,8 @@ def test_share_agrees_with_numpy_roots_to_round_off():
 
 def test_overlapping_obstacles_add_up():
     batch = random_cubics(3, 10)
-    one, _ = PlanarWorld(**FREE, polygons=(SQUARE,)).time_in_collision(batch)
-    two, _ = PlanarWorld(**FREE, polygons=(SQUARE, SQUARE)).time_in_collision(batch)
+    one, _ = share_in_collision(PlanarWorld(**FREE, polygons=(SQUARE,)), batch)
+    two, _ = share_in_collision(PlanarWorld(**FREE, polygons=(SQUARE, SQUARE)), batch)
     np.testing.assert_allclose(two, 2 * one)
 
 
@@ -93,7 +99,7 @@ def test_corner_clipped_between_samples_is_found(depth):
     for sign, hit in ((-1.0, True), (1.0, False)):
         middle = 1.0 + sign * depth / np.sqrt(2.0)
         batch = straight([middle - 1.7, middle + 1.7], [middle + 1.3, middle - 1.3])
-        share, valid = world.time_in_collision(batch)
+        share, valid = share_in_collision(world, batch)
         assert valid[0] == (not hit)
         # Straight across a right angle at 45 degrees: twice the depth of 3 sqrt(2) in all.
         assert share[0] == pytest.approx(2 * depth / np.hypot(3, 3) if hit else 0.0, rel=1e-5)
@@ -106,7 +112,7 @@ def test_tangent_to_an_edge(depth):
     for sign in (1.0, -1.0):
         y = 2.0 + sign * depth
         keys, slopes = np.array([[[-1.0, y], [1.0, y]]]), np.array([[[2.0, -4.0], [2.0, 4.0]]])
-        share, valid = world.time_in_collision(hermite_batch(keys, slopes))
+        share, valid = share_in_collision(world, hermite_batch(keys, slopes))
         assert valid[0] == (sign > 0)
         assert share[0] == pytest.approx(np.sqrt(depth) if sign < 0 else 0.0, rel=1e-4)
 
@@ -131,7 +137,7 @@ def test_tangent_to_an_edge(depth):
     ],
 )
 def test_straight_paths(start, end, share):
-    found, valid = PlanarWorld(**FREE, polygons=(SQUARE,)).time_in_collision(straight(start, end))
+    found, valid = share_in_collision(PlanarWorld(**FREE, polygons=(SQUARE,)), straight(start, end))
     assert found[0] == pytest.approx(share, abs=1e-9)
     assert valid[0] == (share == 0.0)
 
@@ -139,8 +145,8 @@ def test_straight_paths(start, end, share):
 def test_share_does_not_depend_on_where_the_origin_is():
     batch, shift = random_cubics(4, 20), np.array([3.0, -5.0])
     moved = hermite_batch(batch.key_positions + shift, batch.knot_slopes)
-    one, _ = PlanarWorld(**FREE, polygons=(STAR,)).time_in_collision(batch)
-    two, _ = PlanarWorld(**FREE, polygons=(STAR + shift,)).time_in_collision(moved)
+    one, _ = share_in_collision(PlanarWorld(**FREE, polygons=(STAR,)), batch)
+    two, _ = share_in_collision(PlanarWorld(**FREE, polygons=(STAR + shift,)), moved)
     np.testing.assert_allclose(one, two, atol=1e-12)
 
 
@@ -148,7 +154,7 @@ def test_walls_count_as_obstacles():
     world = PlanarWorld(-np.ones(2), np.ones(2))
     batch = random_cubics(5, 12)
     s = (np.arange(100_000) + 0.5) / 100_000
-    share, valid = world.time_in_collision(batch)
+    share, valid = share_in_collision(world, batch)
     sampled = [(np.abs(hermite(batch, row, s)) > 1).any(axis=1).mean() for row in range(12)]
     np.testing.assert_allclose(share, sampled, atol=1e-4)
     assert not valid.any()
@@ -160,7 +166,7 @@ def test_moving_disc_agrees_with_dense_sampling():
     discs = tuple(MovingDisc(rng.uniform(-1, 1, 2), 0.7, rng.normal(0, 1, 2)) for _ in range(2))
     world = PlanarWorld(**FREE, discs=discs)
     start_time, s = 0.4, (np.arange(100_000) + 0.5) / 100_000
-    share, valid = world.time_in_collision(batch, start_time)
+    share, valid = share_in_collision(world, batch, start_time)
     for row in range(12):
         positions, times = hermite(batch, row, s), start_time + batch.duration[row] * s
         sampled = 0.0
@@ -169,14 +175,14 @@ def test_moving_disc_agrees_with_dense_sampling():
             sampled += (np.linalg.norm(positions - centres, axis=1) < disc.radius).mean()
         assert share[row] == pytest.approx(sampled, abs=1e-4)
         assert valid[row] == (sampled == 0.0)
-    later, _ = world.at(start_time).time_in_collision(batch)
+    later, _ = share_in_collision(world.at(start_time), batch)
     np.testing.assert_allclose(later, share, atol=1e-12)
 
 
 def test_disc_grazed_between_samples():
     world = PlanarWorld(**FREE, discs=(MovingDisc((0.0, 0.0), 0.5),))
     for gap, valid in ((1e-9, True), (-1e-9, False)):
-        share, free = world.time_in_collision(straight([-3.0, 0.5 + gap], [3.0, 0.5 + gap]))
+        share, free = share_in_collision(world, straight([-3.0, 0.5 + gap], [3.0, 0.5 + gap]))
         assert free[0] == valid
         assert share[0] == pytest.approx(0.0 if valid else 2 * np.sqrt(0.25 - (0.5 + gap) ** 2) / 6, rel=1e-4)
 
@@ -199,7 +205,7 @@ def _as_trajectory(batch):
 def test_stays_agree_with_the_share_and_with_bisection():
     world = PlanarWorld(**FREE, polygons=(STAR,), discs=(MovingDisc((0.0, 2.0), 0.4, (0.3, 0.0)),))
     batch = random_cubics(7, 20)
-    share, valid = world.time_in_collision(batch)
+    share, valid = share_in_collision(world, batch)
     for row in range(20):
         one = hermite_batch(batch.key_positions[[row]], batch.knot_slopes[[row]], batch.duration[[row]])
         trajectory = _as_trajectory(one)
@@ -284,8 +290,8 @@ def test_infinite_duration_is_never_valid():
     batch = random_cubics(11, 3)
     batch.duration[1] = np.inf
     world = PlanarWorld(**FREE, discs=(MovingDisc((9.0, 9.0), 0.1, (1.0, 0.0)),))
-    share, valid = world.time_in_collision(batch)
-    assert share.tolist() == [0.0, np.inf, 0.0]
+    seconds, valid = world.time_in_collision(batch)
+    assert seconds.tolist() == [0.0, np.inf, 0.0]
     assert valid.tolist() == [True, False, True]
 
 

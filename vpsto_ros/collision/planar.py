@@ -3,8 +3,9 @@
 A path of the search is a cubic between two key positions, so its crossings with the line of an edge are the
 roots of a cubic, and those with a disc in uniform motion the roots of a polynomial of degree six. Between two
 crossings it is inside or outside. A corner clipped between two evaluation points, which the sampled check of
-the thesis (4.5.2) overlooks, is found, and the cost is the true share of the path in collision instead of a
-count of points.
+the thesis (4.5.2) overlooks, is found, and the cost is the exact time in collision instead of a count of
+points. Time and not phase, because a share of phase shrinks when the path takes a slow detour elsewhere: a
+search that pays for phase settles on such a path now and then.
 """
 
 import copy
@@ -181,14 +182,14 @@ class PlanarWorld:
     def time_in_collision(
         self, batch: TrajectoryBatch, start_time: float = 0.0
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Share of its phase that each trajectory spends in collision, exact at every instant.
+        """Time that each trajectory spends in collision, exact at every instant.
 
         Args:
             batch: B trajectories of two degrees of freedom.
             start_time: when they start, on the clock of the discs [s].
 
         Returns:
-            Share (B,), summed over the obstacles and infinite for a trajectory of infinite duration; and
+            Time (B,) [s], summed over the obstacles and infinite for a trajectory of infinite duration; and
             whether it is zero, shape (B,) bool.
 
         Raises:
@@ -198,10 +199,10 @@ class PlanarWorld:
             raise InvalidInputError(
                 f"a planar world takes 2 degrees of freedom, not {batch.key_positions.shape[2]}"
             )
-        share = kernels.shares(
+        seconds = kernels.times_in_collision(
             self.packed, batch.knots, batch.key_positions, batch.knot_slopes, batch.duration, start_time
         )
-        return share, share == 0.0
+        return seconds, seconds == 0.0
 
     def stays(self, trajectory: Trajectory) -> list[Stay]:
         """All parts of a trajectory inside an obstacle, by start; the clock of the discs is its own.
@@ -241,11 +242,11 @@ class PlanarWorld:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CollisionTerm:
-    """A world as a cost term: the weight times the share of the path in collision, and validity.
+    """A world as a cost term: the weight times the time in collision, and validity.
 
     Attributes:
         world: what to stay out of.
-        weight: cost of a path that is in collision all along; larger than any duration [s].
+        weight: cost of a second in collision; well above the cost of a second of motion [1/s].
         start_time: when trajectories start, on the clock of the discs [s].
 
     Raises:
@@ -268,8 +269,8 @@ class CollisionTerm:
 
     def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Cost (B,) and validity (B,) of trajectories."""
-        share, valid = self.world.time_in_collision(batch, self.start_time)
-        return self.weight * share, valid
+        seconds, valid = self.world.time_in_collision(batch, self.start_time)
+        return self.weight * seconds, valid
 
     def explain(self, trajectory: Trajectory) -> list[str]:
         """What a trajectory collides with, in words; its start counts as the start time of this term."""

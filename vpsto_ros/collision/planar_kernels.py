@@ -284,24 +284,24 @@ def occupied(world, o, control, degree, start, end, space):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shares(world, knots, keys, slopes, durations, start_time):
-    """Share of phase (B,) that cubic Hermite segments spend inside obstacles, summed over the obstacles.
+def times_in_collision(world, knots, keys, slopes, durations, start_time):
+    """Time (B,) [s] that cubic Hermite segments spend inside obstacles, summed over the obstacles.
 
     Args:
         world: :class:`PackedWorld`.
         knots: phases (N + 2,).
         keys: key positions (B, N + 2, 2) [m].
         slopes: q' at the knots (B, N + 2, 2) [m].
-        durations: (B,) [s]; infinite in a row gives an infinite share.
+        durations: (B,) [s]; infinite in a row gives an infinite time.
         start_time: of phase zero [s], on the clock of the discs.
     """
-    share = np.zeros(len(keys))
+    total = np.zeros(len(keys))
     space = workspace(world, 3)
     control = np.empty((4, 2))
     obstacles = world.boxes.shape[0] + world.discs.shape[0] + 1
     for b in range(len(keys)):
         if durations[b] == np.inf:
-            share[b] = np.inf
+            total[b] = np.inf
             continue
         for i in range(knots.size - 1):
             h = knots[i + 1] - knots[i]
@@ -312,8 +312,8 @@ def shares(world, knots, keys, slopes, durations, start_time):
             start, end = start_time + durations[b] * knots[i], start_time + durations[b] * knots[i + 1]
             for o in range(obstacles):
                 for pair in range(occupied(world, o, control, 3, start, end, space)):
-                    share[b] += h * (space.cuts[2 * pair + 1] - space.cuts[2 * pair])
-    return share
+                    total[b] += h * durations[b] * (space.cuts[2 * pair + 1] - space.cuts[2 * pair])
+    return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
