@@ -274,8 +274,8 @@ def _table(s: dict[str, Any], compare: bool) -> str:
             f"{s['ompl_duration_to_bound_p50'] or 0:.2f}",
         ])  # fmt: skip
     low, high = success_interval(s["straight_free"], s["runs"])
-    rows.append(["straight move", f"{s['straight_free']} of {s['runs']}", f"{low:.3f}-{high:.3f}", "-", "-", "-",
-                 "-"])  # fmt: skip
+    count = f"{s['straight_free']} of {s['runs']}"
+    rows.append(["straight move", count, f"{low:.3f}-{high:.3f}", "-", "-", "-", "-"])
     header = ["planner", "solved", "95 % CI", "in collision", "search, first / all", "duration", "to bound"]
     return markdown_table(header, rows)
 
@@ -289,9 +289,10 @@ def _remarks(s: dict[str, Any]) -> str:
     if "online_runs" in s:
         low, high = s["online_success_interval"]
         lines.append(
-            f"online at 20 Hz: {s['online_success_rate']:.3f} ({low:.3f}-{high:.3f}) of {s['online_runs']} runs "
-            f"at the goal without collision; the ball blocks the first plan in {s['online_blocked']}; replanning "
-            f"{s['online_replanning_ms_p50']:.0f} ms, p99 {s['online_replanning_ms_p99']:.0f} ms"
+            f"online at 20 Hz: {s['online_success_rate']:.3f} ({low:.3f}-{high:.3f}) of {s['online_runs']} "
+            f"runs at the goal without collision; the ball blocks the first plan in {s['online_blocked']}; "
+            f"replanning {s['online_replanning_ms_p50']:.0f} ms, "
+            f"p99 {s['online_replanning_ms_p99']:.0f} ms"
         )
     if s["failed_seeds"]:
         lines.append(f"not solved: seeds {s['failed_seeds']}")

@@ -34,7 +34,7 @@ def draw_solutions(
     rows = -(-len(solutions) // columns)
     figure = plt.figure(figsize=(5.2 * columns, 5.0 * rows))
     for number, (title, task, postures) in enumerate(solutions):
-        axes = figure.add_subplot(rows, columns, number + 1, projection="3d", computed_zorder=False)
+        axes = figure.add_subplot(rows, columns, number + 1, projection="3d")
         _draw(axes, task, postures)
         axes.set_title(title, fontsize=10)
     figure.tight_layout()
@@ -65,7 +65,7 @@ def _add(axes, shape: Shape, colour: str, opacity: float) -> None:
 
     if isinstance(shape, HalfSpace):
         corners = np.array([(-0.9, -0.9, 0.0), (0.9, -0.9, 0.0), (0.9, 0.9, 0.0), (-0.9, 0.9, 0.0)])
-        axes.add_collection3d(Poly3DCollection([corners], facecolor=_TABLE, alpha=0.6, zorder=-1))
+        axes.add_collection3d(Poly3DCollection([corners], facecolor=_TABLE, alpha=0.6))
     elif isinstance(shape, Box):
         faces = _faces(shape)
         axes.add_collection3d(Poly3DCollection(faces, facecolor=colour, edgecolor="#7a4a1a", linewidth=0.4,

@@ -63,6 +63,8 @@ class PathCheck:
 class ArmCollision:
     """The arm in a cell of obstacles; immutable.
 
+    ``pair_names`` are the names (link, other) of all pairs that are looked at.
+
     Args:
         robot_model: the arm; the FR3 with its pushing rod by default.
         obstacles: any number of named shapes in the frame of the base; without any, only the arm itself is
@@ -91,7 +93,7 @@ class ArmCollision:
         self._whole_cell = cell_arrays(self._arm, self.obstacles, math.inf)
         self._reach = self._arm.radius + self.margin
         self._pair_reach = self._arm.radius[self._arm.pairs].sum(axis=1) + self.margin
-        self._pair_names = _pair_names(self)
+        self.pair_names: list[tuple[str, str]] = _named_pairs(self)
 
     def with_obstacles(self, obstacles: Sequence[Shape]) -> "ArmCollision":
         """The same arm and margin among other obstacles, as when they move; fast enough for every cycle."""
@@ -134,7 +136,7 @@ class ArmCollision:
         """The closest pair at one posture (7,) [rad]; None if there is nothing to meet."""
         rows = _one_posture(q)
         distance, pair = self._nearest(rows)
-        return None if pair[0] < 0 else Contact(*self._pair_names[pair[0]], float(distance[0]))
+        return None if pair[0] < 0 else Contact(*self.pair_names[int(pair[0])], float(distance[0]))
 
     def contacts(self, q: ArrayLike, *, margin: float | None = None) -> list[Contact]:
         """All pairs closer than a margin [m] (that of the checker by default) at q (7,) [rad], deepest first.
@@ -143,10 +145,10 @@ class ArmCollision:
             InvalidInputError: as :meth:`in_collision`.
         """
         rows, limit = _one_posture(q), self.margin if margin is None else margin
-        found = np.empty((1, len(self._pair_names)))
+        found = np.empty((1, len(self.pair_names)))
         distances.every_pair(self._arm, self._whole_cell, rows, found)
         order = [int(i) for i in np.argsort(found[0], kind="stable") if found[0, i] < limit]
-        return [Contact(*self._pair_names[i], float(found[0, i])) for i in order]
+        return [Contact(*self.pair_names[int(i)], float(found[0, i])) for i in order]
 
     def require_free(self, q: ArrayLike, name: str) -> None:
         """Refuse a posture in collision.
@@ -198,11 +200,11 @@ class ArmCollision:
     def explain(self, trajectory: Trajectory, *, samples: int = 500) -> list[str]:
         """What a motion collides with, in words: the deepest overlap of every pair and when it happens."""
         times = np.linspace(trajectory.start_time, trajectory.end_time, samples)
-        found = np.empty((samples, len(self._pair_names)))
+        found = np.empty((samples, len(self.pair_names)))
         distances.every_pair(self._arm, self._whole_cell, _postures(trajectory(times))[0], found)
         deepest = found.min(axis=0, initial=math.inf)
         return [
-            f"{Contact(*self._pair_names[n], float(deepest[n]))} at {times[found[:, n].argmin()]:.3f} s"
+            f"{Contact(*self.pair_names[int(n)], float(deepest[n]))} at {times[found[:, n].argmin()]:.3f} s"
             for n in np.argsort(deepest, kind="stable")
             if deepest[n] < self.margin
         ]
@@ -223,7 +225,7 @@ class ArmCollision:
         return distance, pair
 
 
-def _pair_names(checker: ArmCollision) -> list[tuple[str, str]]:
+def _named_pairs(checker: ArmCollision) -> list[tuple[str, str]]:
     """Names of all pairs in the order of the kernels."""
     parts, cell = checker.model.names, checker._whole_cell
     kinds = ((HalfSpace, cell.plane_pairs), (Box, cell.box_pairs), (Sphere | Capsule, cell.capsule_pairs))

@@ -144,8 +144,8 @@ def through(problem: JointSpaceProblem, postures: NDArray[np.float64]) -> NDArra
     keys[:, 0], keys[:, 1:-1], keys[:, -1] = problem.start, postures, problem.goal
     phases = problem.basis.n_via + 2
     batch = synthesize_batch(
-        OptimalBasis.uniform(inner), keys, problem.start_velocity, problem.end_velocity, problem.limits, phases,
-        derivatives=False,
+        OptimalBasis.uniform(inner), keys, problem.start_velocity, problem.end_velocity, problem.limits,
+        phases, derivatives=False,
     )  # fmt: skip
     return batch.position[:, 1:-1]
 
