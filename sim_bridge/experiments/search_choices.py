@@ -101,7 +101,7 @@ def compare_searches(seeds: list[int], execution: Execution) -> Rows:
 
 
 def compare_replanning(seeds: list[int], execution: Execution) -> Rows:
-    """Online VP-STO to the goal; the cost is the time until it is reached, relative to a seed's fastest run."""
+    """Online VP-STO to the goal; the cost is the time until it is reached, relative to the seed's fastest."""
 
     def tasks(changes: dict[str, Any], world: str) -> list[clutter_mpc_runs.Task]:
         config = online_config(changes)

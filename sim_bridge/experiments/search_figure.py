@@ -25,6 +25,7 @@ def draw(
         titles: of the problems.
     """
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     lines = -(-len(choices) // COLUMNS)
     figure = Figure(figsize=(4.0 * COLUMNS, 4.2 * lines), layout="constrained")
@@ -45,6 +46,6 @@ def draw(
         axes.set_ylim(bottom=0.0)
         axes.set_title(choice.name, fontsize=10)
         axes.set_ylabel("excess over the best known [%]", fontsize=8)
-        if number % COLUMNS == 0:
-            axes.legend(fontsize=7)
+    handles = [Line2D([], [], color=colours[name], marker="o", ms=3.5, lw=0.7) for name in titles]
+    figure.legend(handles, titles.values(), loc="outside lower center", ncols=len(titles), fontsize=8)
     figure.savefig(path, dpi=120)

@@ -16,8 +16,8 @@ CLEARLY_BETTER, POSSIBLY_WORSE = 0.001, 0.05
 MATTERS = 0.005
 """Smallest difference of the median gap that counts."""
 
-SLOWER = 1.25
-"""Ratio of processor times from which on the longer one counts as worse."""
+SLOWER = 1.5
+"""Ratio of processor times over all problems from which on the longer one counts as worse."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def better(first: Sample, second: Sample) -> bool:
 def dominates(first: dict[str, Sample], second: dict[str, Sample]) -> bool:
     """Whether one value of an option should replace another.
 
-    It should if it is clearly better on a problem, and on none possibly worse or slower.
+    It should if it is clearly better on a problem, on none possibly worse, and not slower altogether.
 
     Args:
         first: samples by problem.
@@ -88,8 +88,7 @@ def dominates(first: dict[str, Sample], second: dict[str, Sample]) -> bool:
     """
     if not any(better(first[name], second[name]) for name in first):
         return False
-    return not any(
-        lower(second[name], first[name], POSSIBLY_WORSE)
-        or first[name].seconds > SLOWER * second[name].seconds
-        for name in first
-    )
+    if any(lower(second[name], first[name], POSSIBLY_WORSE) for name in first):
+        return False
+    seconds = [sum(sample.seconds for sample in samples.values()) for samples in (first, second)]
+    return seconds[0] <= SLOWER * seconds[1]
