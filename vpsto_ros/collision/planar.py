@@ -229,9 +229,10 @@ class PlanarWorld:
         for stay in self.stays(trajectory):
             times = np.linspace(stay.start, stay.end, 101)
             depth = -float(self.clearance(trajectory(times), times).min())
+            always = stay.start <= trajectory.start_time and stay.end >= trajectory.end_time
+            when = "all along" if always else f"from {stay.start:.3f} s to {stay.end:.3f} s"
             lines.append(
-                f"in collision with {stay.obstacle} from {stay.start:.3f} s to {stay.end:.3f} s, "
-                f"up to {1e3 * max(depth, 0.0):.3g} mm deep"
+                f"in collision with {stay.obstacle} {when}, up to {1e3 * max(depth, 0.0):.3g} mm deep"
             )
         return lines
 
@@ -265,7 +266,7 @@ class CollisionTerm:
     @property
     def static(self) -> bool:
         """Whether no obstacle moves, so that a goal in collision stays one."""
-        return not self.world.discs
+        return not any(disc.velocity.any() for disc in self.world.discs)
 
     def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Cost (B,) and validity (B,) of trajectories."""
