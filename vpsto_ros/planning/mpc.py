@@ -1,9 +1,8 @@
 """Online VP-STO: one step of model-predictive control (4.4, Algorithm 1), for any problem.
 
 The thesis prints Algorithm 1 without its body; the steps follow the text of section 4.4. A problem says what
-a candidate costs, where to
-look first and how via-points become a trajectory; :class:`OnlineVpsto` decides between stopping, warm-
-starting and exploring.
+a candidate costs, where to look first and how via-points become a trajectory; :class:`OnlineVpsto` decides
+between stopping, warm-starting and exploring.
 """
 
 import dataclasses
