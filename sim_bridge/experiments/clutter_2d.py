@@ -302,7 +302,8 @@ def more_table(results: dict[str, Any]) -> str:
     rows = [
         [
             name, n, f"{m['runs']}",
-            _seconds(m["best_duration_s"], m["median_duration_s"]), f"{m['invalid']}", f"{m['solve_ms_p50']:.0f} ms",
+            _seconds(m["best_duration_s"], m["median_duration_s"]), f"{m['invalid']}",
+            f"{m['solve_ms_p50']:.0f} ms",
         ]
         for name, r in results.items()
         for n, m in r["more_via_points"].items()

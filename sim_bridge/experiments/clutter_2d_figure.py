@@ -28,7 +28,8 @@ def write(path: pathlib.Path, problem: JointSpaceProblem, outcomes: Sequence[Any
     import matplotlib.pyplot as plt
 
     figure = plt.figure(figsize=(13, 6), layout="constrained")
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=(1.0, 1.15)))
+    grid: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.15))
+    left, right = grid
     _paths(left.subplots(), problem, outcomes)
     _profiles(right.subplots(3, 2, sharex=True), problem, [each for each in outcomes if each.valid])
     figure.savefig(path, dpi=120)

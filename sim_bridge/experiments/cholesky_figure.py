@@ -1,0 +1,68 @@
+"""The figure of the search with and without the prior: first candidates, results, costs over iterations."""
+
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sim_bridge.experiments.clutter_world import draw_world
+
+SHOWN = 60
+COLOURS = {"with_prior": "tab:blue", "without_prior": "tab:orange"}
+
+
+def write(path: pathlib.Path, outcomes: Mapping[tuple[str, str], Sequence[Any]]) -> None:
+    """Draw into a PNG file.
+
+    Args:
+        path: of the file.
+        outcomes: by strategy and prior, with `points` (or None) and `means` each.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from sim_bridge.experiments.cholesky import STRATEGIES
+
+    figure, grid = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
+    for row, strategy in zip(grid, STRATEGIES, strict=True):
+        for axes, start in zip(row, ("without_prior", "with_prior"), strict=False):
+            _paths(axes, start, outcomes[strategy, start])
+            axes.set_title(f"{STRATEGIES[strategy]}, {start.replace('_', ' ')}", fontsize=10)
+        _costs(row[2], {start: outcomes[strategy, start] for start in COLOURS})
+        row[2].set_title(f"{STRATEGIES[strategy]}: cost of the mean", fontsize=10)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _paths(axes: Any, start: str, runs: Sequence[Any]) -> None:
+    """Candidates of a first population, and what the runs found."""
+    from sim_bridge.experiments.cholesky import WORLD, prior, problem
+
+    draw_world(axes, WORLD)
+    plan = problem()
+    first = prior(start).sample(np.random.default_rng(0), SHOWN // 2)
+    found = [run.points for run in runs[:SHOWN] if run.points is not None]
+    for points, style in (
+        *((each, {"color": "0.6", "lw": 0.6}) for each in first),
+        *((each, {"color": COLOURS[start], "lw": 0.8, "alpha": 0.6}) for each in found),
+    ):
+        trajectory = plan.trajectory(points)
+        axes.plot(*trajectory(np.linspace(0.0, trajectory.duration, 300)).T, **style, zorder=2)
+    axes.plot(*np.array([plan.start, plan.goal]).T, "k--", lw=1.0, zorder=3)
+
+
+def _costs(axes: Any, runs: Mapping[str, Sequence[Any]]) -> None:
+    """Median and the middle 90 % over the runs; a run that has settled keeps its last cost."""
+    longest = max(len(run.means) for each in runs.values() for run in each)
+    for start, each in runs.items():
+        costs = np.array([np.pad(run.means, (0, longest - len(run.means)), "edge") for run in each])
+        low, middle, high = np.quantile(costs, [0.05, 0.5, 0.95], axis=0)
+        iterations = np.arange(1, longest + 1)
+        axes.fill_between(iterations, low, high, color=COLOURS[start], alpha=0.2)
+        axes.plot(iterations, middle, color=COLOURS[start], label=start.replace("_", " "))
+    axes.set(xscale="log", yscale="log", xlabel="iteration", ylabel="duration + 100 x time in collision [s]")
+    axes.grid(alpha=0.3)
+    axes.legend()
