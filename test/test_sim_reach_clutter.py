@@ -102,9 +102,9 @@ def test_online_counts_a_collision_that_nobody_can_avoid(solved):
     first = problem.trajectory(points)
     elbow = ArmCollision().capsules(first(0.5))[6].a
     away = Intruder(0.0, np.array([0.0, 0.0, 5.0]), np.zeros(3))
-    calm = run_online(task, first, away, LIMITS, seed=0)
+    calm = run_online(task, first, LIMITS, 0, intruder=away)
     assert calm.reached and calm.collisions == 0 and not calm.replanned
-    struck = run_online(task, first, Intruder(0.5, elbow, np.zeros(3)), LIMITS, seed=0)
+    struck = run_online(task, first, LIMITS, 0, intruder=Intruder(0.5, elbow, np.zeros(3)))
     assert struck.collisions > 0 and struck.replanned
 
 
@@ -112,10 +112,11 @@ def test_intruders_leave_room_when_they_show_up(solved):
     task, problem, _, points = solved
     first = problem.trajectory(points)
     for moving in (False, True):
-        intruder = random_intruder(task, first, np.random.default_rng(0), moving=moving)
+        intruder = random_intruder(task, first, 0.3, np.random.default_rng(0), moving=moving)
         assert intruder is not None and np.any(intruder.velocity != 0.0) == moving
-        there = ArmCollision(None, [intruder.at(intruder.time)])
-        assert there.distance(first(intruder.time)) > 0.1
+        for time in np.linspace(0.3, 0.6, 20):
+            there = ArmCollision(None, [intruder.at(time)])
+            assert there.distance(first(time)) > 0.1
         assert intruder.ahead(1.0).radius == intruder.at(1.0).radius
 
 
