@@ -11,8 +11,6 @@ from vpsto_ros.collision.arm_model import fr3_capsules
 from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere, rotation_z
 
 POSTURE_CLEARANCE = 0.02  # of start and goal [m]
-BASE_CLEARANCE = 0.22  # of obstacles on the table from the axis of joint 1 [m]
-_ROOM_FOR_SHOULDER = 0.25  # of hanging obstacles from the shoulder [m]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,8 +31,8 @@ class ReachTask:
 def random_task(seed: int) -> ReachTask:
     """A cell, and two postures uniform over the joint ranges that keep 2 cm from everything.
 
-    Nothing is done to make sure that a way between them exists. Only cells that enclose the column of the
-    base are drawn again.
+    Nothing is done to make sure that a way between them exists. A cell with fewer than two such postures in
+    20 000, which has not been seen yet, would be drawn again.
     """
     rng = np.random.default_rng([seed, 77])
     model = fr3_capsules()

@@ -74,8 +74,8 @@ def random_intruder(
     """A ball that shows up now, in the way of the motion that is being executed; None if there is no room.
 
     It will be where the tool would pass. What the arm cannot avoid is no test of a planner: for the next
-    0.3 s, in which the planner has to see it and the arm to brake, the motion stays 12 cm away from it, and it
-    leaves the goal posture as much room.
+    0.3 s, in which the planner has to see it and the arm to brake, the motion stays 12 cm away from it, and
+    it leaves the goal posture as much room.
     """
     bare = ArmCollision(None, ())
     soon = motion(now + np.linspace(0.0, _REACTION, 7))
