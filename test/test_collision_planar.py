@@ -86,6 +86,17 @@ def test_share_agrees_with_numpy_roots_to_round_off():
         assert share[row] == pytest.approx(np.diff(cuts)[winding(STAR, middles)].sum(), abs=1e-7)
 
 
+def test_paths_through_corners_and_along_edges_agree_with_dense_sampling():
+    # Whole-number coordinates line ends, corners and edges up, where roots coincide.
+    rng, s = np.random.default_rng(13), (np.arange(4000) + 0.5) / 4000
+    batch = hermite_batch(
+        rng.integers(-3, 4, (300, 3, 2)).astype(float), rng.integers(-8, 9, (300, 3, 2)).astype(float)
+    )
+    share, _ = share_in_collision(PlanarWorld(**FREE, polygons=(SQUARE,)), batch)
+    sampled = [winding(SQUARE, hermite(batch, row, s)).mean() for row in range(300)]
+    np.testing.assert_allclose(share, sampled, atol=2e-3)
+
+
 def test_overlapping_obstacles_add_up():
     batch = random_cubics(3, 10)
     one, _ = share_in_collision(PlanarWorld(**FREE, polygons=(SQUARE,)), batch)

@@ -175,25 +175,20 @@ def _polygon_cuts(world, p, degree, hull, space):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _disc_cuts(radius, degree, space):
     """Cuts of the piece, relative to the centre, with a circle: |q|^2 = r^2, a polynomial of degree 2 d."""
-    form = space.form
-    form[: 2 * degree + 1] = -0.5 * radius
-    outer_i = 1.0  # binomial (d over i)
+    form, path = space.form, space.path
+    form[: 2 * degree + 1] = 0.0
+    over_i = 1.0  # binomial coefficients (degree over i) and (degree over j)
     for i in range(degree + 1):
-        outer_j = 1.0
+        over_j = 1.0
         for j in range(degree + 1):
-            product = space.path[0, i] * space.path[0, j] + space.path[1, i] * space.path[1, j]
-            form[i + j] += outer_i * outer_j * product / (2.0 * radius * _binomial(2 * degree, i + j))
-            outer_j *= (degree - j) / (j + 1.0)
-        outer_i *= (degree - i) / (i + 1.0)
+            form[i + j] += over_i * over_j * (path[0, i] * path[0, j] + path[1, i] * path[1, j])
+            over_j *= (degree - j) / (j + 1.0)
+        over_i *= (degree - i) / (i + 1.0)
+    over = 1.0
+    for k in range(2 * degree + 1):
+        form[k] = (form[k] / over - radius * radius) / (2.0 * radius)
+        over *= (2 * degree - k) / (k + 1.0)
     return roots(form, 2 * degree, 0.1 * TOUCH, space.stack, space.cuts, 1)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _binomial(n, k):
-    value = 1.0
-    for i in range(k):
-        value *= (n - i) / (i + 1.0)
-    return value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -219,6 +214,19 @@ def _is_inside(world, o, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _out_of_reach(world, o, hull):
+    """Whether a piece in this box cannot enter obstacle o; never said of a disc, which may move."""
+    polygons = world.boxes.shape[0]
+    if o < polygons:
+        box = world.boxes[o]
+        return hull[0] >= box[2] or hull[1] >= box[3] or hull[2] <= box[0] or hull[3] <= box[1]
+    if o < polygons + world.discs.shape[0]:
+        return False
+    low_x, low_y, high_x, high_y = world.walls
+    return hull[0] >= low_x and hull[1] >= low_y and hull[2] <= high_x and hull[3] <= high_y
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cuts(world, o, control, degree, start, end, space):
     """Cuts of a piece with obstacle o in cuts[1:count], and whether it can be inside at all (count > 0)."""
     polygons, discs, none = world.boxes.shape[0], world.discs.shape[0], world.walls[:0]
@@ -229,14 +237,10 @@ def _cuts(world, o, control, degree, start, end, space):
         if max(hull[0], hull[1], -hull[2], -hull[3]) >= radius:
             return 0
         return _disc_cuts(radius, degree, space)
-    if o < polygons:
-        box = world.boxes[o]
-        if hull[0] >= box[2] or hull[1] >= box[3] or hull[2] <= box[0] or hull[3] <= box[1]:
-            return 0
-        return _polygon_cuts(world, o, degree, hull, space)
-    low_x, low_y, high_x, high_y = world.walls
-    if hull[0] >= low_x and hull[1] >= low_y and hull[2] <= high_x and hull[3] <= high_y:
+    if _out_of_reach(world, o, hull):
         return 0
+    if o < polygons:
+        return _polygon_cuts(world, o, degree, hull, space)
     return _wall_cuts(world, degree, space)
 
 
@@ -310,7 +314,10 @@ def times_in_collision(world, knots, keys, slopes, durations, start_time):
                 control[1, j] = keys[b, i, j] + h / 3.0 * slopes[b, i, j]
                 control[2, j] = keys[b, i + 1, j] - h / 3.0 * slopes[b, i + 1, j]
             start, end = start_time + durations[b] * knots[i], start_time + durations[b] * knots[i + 1]
+            hull = _set_path(control, 3, world.walls[:0], start, end, space.path)
             for o in range(obstacles):
+                if _out_of_reach(world, o, hull):
+                    continue
                 for pair in range(occupied(world, o, control, 3, start, end, space)):
                     total[b] += h * durations[b] * (space.cuts[2 * pair + 1] - space.cuts[2 * pair])
     return total

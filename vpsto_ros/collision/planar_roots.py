@@ -54,18 +54,28 @@ def _sign_changes(coefficients, degree, tolerance):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _single_root(coefficients, degree, first, tolerance, work):
     """The root of a polynomial that starts with sign `first` and crosses zero once: Newton in a bracket."""
-    low, high, u = 0.0, 1.0, 0.5
-    for iteration in range(80):
+    left, right = coefficients[0], coefficients[degree]
+    low, high, before = 0.0, 1.0, np.inf
+    # Another root at an end would attract Newton's method; bisection sees only the change of sign.
+    smooth = abs(left) > tolerance and abs(right) > tolerance
+    u = left / (left - right) if smooth else 0.5
+    for _ in range(100):
         value, slope = value_and_slope(coefficients, degree, u, work)
-        if abs(value) <= 0.01 * tolerance or high - low < 1e-15:
+        if smooth and abs(value) <= 0.01 * tolerance:
             break
         if value * first > 0.0:
             low = u
         else:
             high = u
-        u -= value / slope
-        if not low < u < high or iteration % 4 == 3:
+        step = value / slope
+        halved, before = smooth and abs(value) <= 0.5 * before, abs(value)
+        if halved and low < u - step < high:
+            u -= step
+        else:
+            step = high - low
             u = 0.5 * (low + high)
+        if abs(step) < 1e-15:
+            break
     return u
 
 
