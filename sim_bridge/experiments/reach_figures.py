@@ -65,7 +65,9 @@ def _add(axes, shape: Shape, colour: str, opacity: float) -> None:
 
     if isinstance(shape, HalfSpace):
         corners = np.array([(-0.9, -0.9, 0.0), (0.9, -0.9, 0.0), (0.9, 0.9, 0.0), (-0.9, 0.9, 0.0)])
-        axes.add_collection3d(Poly3DCollection([corners], facecolor=_TABLE, alpha=0.6))
+        table = Poly3DCollection([corners], facecolor=_TABLE, alpha=0.6)
+        table.set_sort_zpos(-5.0)  # else it is drawn over what stands on it
+        axes.add_collection3d(table)
     elif isinstance(shape, Box):
         faces = _faces(shape)
         axes.add_collection3d(Poly3DCollection(faces, facecolor=colour, edgecolor="#7a4a1a", linewidth=0.4,
