@@ -39,6 +39,8 @@ setup(
         ],
         "cluster": ["dask>=2024.1", "distributed>=2024.1"],
         "pycma": ["cma>=4"],
+        # The planner that `vpsto experiment reach_clutter` compares with.
+        "compare": ["ompl>=2,<3"],
         "test": ["pytest>=7", "pytest-xdist>=3.5", "hypothesis>=6", "distributed>=2024.1"],
         "lint": ["ruff>=0.12", "mypy>=1.11"],
     },
