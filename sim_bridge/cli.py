@@ -26,16 +26,16 @@ exit status: 0 success, 1 the run failed, 2 the command was not understood
 
 DEMOS = {"push_box": "sim_bridge.demo.push_box"}
 EXPERIMENTS = {
-    "push_box": "sim_bridge.experiments.push_box",
-    "push_t": "sim_bridge.experiments.push_t",
-    "planning_space": "sim_bridge.experiments.planning_space",
-    "clutter_2d": "sim_bridge.experiments.clutter_2d",
-    "clutter_2d_mpc": "sim_bridge.experiments.clutter_2d_mpc",
-    "via_points": "sim_bridge.experiments.via_points",
-    "cholesky": "sim_bridge.experiments.cholesky",
-    "key_timing": "sim_bridge.experiments.key_timing",
-    "reach_clutter": "sim_bridge.experiments.reach_clutter",
-    "search": "sim_bridge.experiments.search_choices",
+    "push_box": "sim_bridge.experiments.pushing.push_box",
+    "push_t": "sim_bridge.experiments.pushing.push_t",
+    "planning_space": "sim_bridge.experiments.pushing.planning_space",
+    "clutter_2d": "sim_bridge.experiments.clutter.clutter_2d",
+    "clutter_2d_mpc": "sim_bridge.experiments.clutter.clutter_2d_mpc",
+    "via_points": "sim_bridge.experiments.timing.via_points",
+    "cholesky": "sim_bridge.experiments.clutter.cholesky",
+    "key_timing": "sim_bridge.experiments.timing.key_timing",
+    "reach_clutter": "sim_bridge.experiments.reaching.reach_clutter",
+    "search": "sim_bridge.experiments.search.choices",
 }
 
 

@@ -11,9 +11,9 @@ import time
 import numpy as np
 
 from sim_bridge.bench.library_rows import cell
-from sim_bridge.experiments import clutter_mpc_runs
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS
-from sim_bridge.experiments.pushing_loop import push_box_loop
+from sim_bridge.experiments.clutter import mpc_runs
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
+from sim_bridge.experiments.pushing.loop import push_box_loop
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.planar import MovingDisc
@@ -68,7 +68,7 @@ def plan_in_clutter() -> None:
     world.inside(ends[0])
     world.explain(trajectory)
     for baseline in (False, True):
-        clutter_mpc_runs.warm_up(baseline)
+        mpc_runs.warm_up(baseline)
 
 
 def plan_in_a_cell() -> None:
@@ -82,6 +82,7 @@ def plan_in_a_cell() -> None:
     checker.distance(middle)
     checker.free_along(trajectory)
     checker.explain(trajectory)
+    checker.capsules(middle)
 
 
 def _search(problem: JointSpaceProblem) -> Trajectory:

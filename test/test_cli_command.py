@@ -1,4 +1,3 @@
-import importlib.util
 
 import pytest
 
@@ -60,8 +59,6 @@ def test_defaults_of_the_demo():
 
 @pytest.mark.parametrize("name", sorted(cli.EXPERIMENTS))
 def test_experiments_take_the_common_options(name):
-    if importlib.util.find_spec(cli.EXPERIMENTS[name]) is None:
-        pytest.skip("not there yet")
     common = ["--runs", "3", "--seed", "5", "--out", "there", "--jobs", "2", "--resume"]
     arguments = ["experiment", name, *common]
     parsed = cli.build_parser(arguments).parse_args(arguments)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim_bridge import cli
-from sim_bridge.experiments import cholesky, clutter_2d
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS, draw_world, homotopy_class
+from sim_bridge.experiments.clutter import cholesky, clutter_2d
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS, draw_world, homotopy_class
 from vpsto_ros.collision.planar import MovingDisc, PlanarWorld
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.optimization.costs import JointSpaceProblem

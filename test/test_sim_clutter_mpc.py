@@ -8,10 +8,10 @@ import json
 import numpy as np
 import pytest
 
-from sim_bridge.experiments import clutter_2d_mpc, clutter_mpc_discs, clutter_mpc_runs, mppi
-from sim_bridge.experiments.clutter_mpc_discs import BouncingDisc, DiscMargin, random_discs, stays
-from sim_bridge.experiments.clutter_mpc_runs import PERIOD, Task, VpstoController, run_task
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS
+from sim_bridge.experiments.clutter import clutter_2d_mpc, moving_discs, mpc_runs, mppi
+from sim_bridge.experiments.clutter.moving_discs import BouncingDisc, DiscMargin, random_discs, stays
+from sim_bridge.experiments.clutter.mpc_runs import PERIOD, Task, VpstoController, run_task
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from vpsto_ros.collision.planar import MovingDisc, PlanarWorld
 from vpsto_ros.planning.joint_space import OnlineJointSpaceProblem
 from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize, synthesize_batch
@@ -21,7 +21,7 @@ STILL = np.zeros(2)
 
 
 def disc(velocity=(0.05, -0.03), centre=(0.3, 0.2), radius=0.03):
-    lower, upper = clutter_mpc_discs.REGION[0] + radius, clutter_mpc_discs.REGION[1] - radius
+    lower, upper = moving_discs.REGION[0] + radius, moving_discs.REGION[1] - radius
     return BouncingDisc(np.array(centre), np.array(velocity), radius, lower, upper)
 
 
@@ -53,7 +53,7 @@ def test_random_discs_do_not_make_collisions_unavoidable(seed):
     start = STARTS[START]
     discs = random_discs(np.random.default_rng(seed), start, 20.0)
     again = random_discs(np.random.default_rng(seed), start, 20.0)
-    assert len(discs) in range(clutter_mpc_discs.COUNTS[0], clutter_mpc_discs.COUNTS[1] + 1)
+    assert len(discs) in range(moving_discs.COUNTS[0], moving_discs.COUNTS[1] + 1)
     for one, other in zip(discs, again, strict=True):
         np.testing.assert_array_equal(one.centre, other.centre)
         path = np.array([one.state(time)[0] for time in np.linspace(0.0, 20.0, 4001)])
@@ -167,7 +167,7 @@ def test_a_collision_and_a_broken_limit_are_counted(monkeypatch):
             ends = (STARTS[START] + min(t / 3.0, 1.0) * (GOAL - STARTS[START]) for t in (begin, end))
             return Trajectory.from_points(np.array([begin, end]), np.stack(list(ends)))
 
-    monkeypatch.setattr(clutter_mpc_runs, "VpstoController", Ghost)
+    monkeypatch.setattr(mpc_runs, "VpstoController", Ghost)
     result = run_task(Task(clutter_2d_mpc.VPSTO, "vpsto", START, False, 1000, longest=3.2))
     assert result.contact is not None and result.contact[0] == "L"
     assert result.time_to_goal is not None and not result.success

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sim_bridge import cli
-from sim_bridge.experiments import push_box, push_t
-from sim_bridge.experiments.pushing_experiment import Targets, results_table, run_variant, summarise
-from sim_bridge.experiments.pushing_loop import Recording
-from sim_bridge.experiments.pushing_trials import KNOCK_MARGIN, Trial, run_trial
+from sim_bridge.experiments.pushing import push_box, push_t
+from sim_bridge.experiments.pushing.experiment import Targets, results_table, run_variant, summarise
+from sim_bridge.experiments.pushing.loop import Recording
+from sim_bridge.experiments.pushing.trials import KNOCK_MARGIN, Trial, run_trial
 from sim_bridge.experiments.runs import markdown_table, quantile, success_interval, write_summary
 from sim_bridge.scene import ObjectPlant
 from vpsto_ros.contact.geometry import PlanarShape

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from sim_bridge.experiments import reach_clutter, reach_ompl
-from sim_bridge.experiments.reach_cells import POSTURE_CLEARANCE, random_task
-from sim_bridge.experiments.reach_online import Intruder, random_intruder, run_online
+from sim_bridge.experiments.reaching import ompl_planner, reach_clutter
+from sim_bridge.experiments.reaching.cells import POSTURE_CLEARANCE, random_task
+from sim_bridge.experiments.reaching.online import Intruder, random_intruder, run_online
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.planning.reaching import ReachConfig, plan_reach, through
@@ -123,11 +123,11 @@ def test_intruders_leave_room_when_they_show_up(solved):
 def test_polygon_is_timed_without_cutting_corners(solved):
     task, _, checker, points = solved
     path = np.vstack([task.start, points, task.goal])
-    motion = reach_ompl.timed(path, checker, LIMITS)
+    motion = ompl_planner.timed(path, checker, LIMITS)
     if motion is not None:
         assert checker.with_margin(0.0).free_along(motion).free and motion.violations(LIMITS) == []
     line = np.stack([task.start, task.start + 0.05])
-    timed = reach_ompl.timed(line, ArmCollision(), LIMITS)
+    timed = ompl_planner.timed(line, ArmCollision(), LIMITS)
     assert timed is not None and timed.duration < 1.0
 
 

@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_bridge.experiments import run_store
-from sim_bridge.experiments.run_store import RunStore, fingerprint
-from sim_bridge.experiments.run_workers import TrialError
-from sim_bridge.experiments.runs import Execution, describe, run_trials
+from sim_bridge.experiments.runs import Execution, describe, run_trials, store
+from sim_bridge.experiments.runs.store import RunStore, fingerprint
+from sim_bridge.experiments.runs.workers import TrialError
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,7 +131,7 @@ def test_only_the_same_task_of_the_same_version_is_taken_over(tmp_path, monkeypa
     assert ran(tmp_path) == [7]
     run_trials(logged, [*first, (str(tmp_path), 7)], resume, "a")
     assert ran(tmp_path) == []
-    monkeypatch.setattr(run_store, "__version__", "99.0")
+    monkeypatch.setattr(store, "__version__", "99.0")
     run_trials(logged, first, resume, "a")
     assert ran(tmp_path) == [0, 1, 2]
 
@@ -284,13 +283,13 @@ def test_an_execution_from_the_command_line(tmp_path):
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_scheduler_that_does_not_answer_is_named(address, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("sim_bridge.experiments.run_workers.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("sim_bridge.experiments.runs.workers.CONNECT_SECONDS", 0.5)
     with pytest.raises(ConfigurationError, match=f"no Dask scheduler answers at {address} within 0.5 s"):
         run_trials(random_sum, range(2), Execution(scheduler=address), "nobody")
 
 
 def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
-    monkeypatch.setattr("sim_bridge.experiments.run_workers.__version__", "99.0")
+    monkeypatch.setattr("sim_bridge.experiments.runs.workers.__version__", "99.0")
     with pytest.raises(ConfigurationError, match=r"has vpsto_ros .*, here it is 99\.0"):
         run_trials(random_sum, range(2), Execution(scheduler=scheduler), "other version")
 

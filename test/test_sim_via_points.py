@@ -9,8 +9,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.optimize import linprog
 
-from sim_bridge.experiments import key_timing, via_points
-from sim_bridge.experiments.linear_program import optimal_duration
+from sim_bridge.experiments.timing import key_timing, via_points
+from sim_bridge.experiments.timing.linear_program import optimal_duration
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory import MINIMUM_DURATION, Limits, OptimalBasis, minimal_duration
 

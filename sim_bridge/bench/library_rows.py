@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from sim_bridge.bench.measuring import Action, Cores, Row
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere

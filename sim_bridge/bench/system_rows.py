@@ -10,11 +10,11 @@ import threading
 import numpy as np
 
 from sim_bridge.bench.measuring import Action, Cores, Row
-from sim_bridge.experiments.pushing_loop import push_box_loop
+from sim_bridge.experiments.pushing.loop import push_box_loop
 from sim_bridge.simulation import Simulation
 from vpsto_ros.planning.goal import PlanarGoal
 
-FIRST_PLAN = "from sim_bridge.experiments.pushing_loop import push_box_loop; push_box_loop().advance(0.5)"
+FIRST_PLAN = "from sim_bridge.experiments.pushing.loop import push_box_loop; push_box_loop().advance(0.5)"
 GOALS = ((0.55, 0.12), (0.48, -0.12), (0.58, 0.0), (0.45, 0.1))
 
 

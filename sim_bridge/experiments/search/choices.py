@@ -15,16 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments import clutter_mpc_runs, search_deadline, search_figure, search_problems
+from sim_bridge.experiments.clutter import mpc_runs
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
+    print_verdict,
     run_trials,
     success_interval,
     write_summary,
 )
-from sim_bridge.experiments.search_statistics import Sample, dominates
-from sim_bridge.experiments.search_variants import (
+from sim_bridge.experiments.search import deadline, figure, problems
+from sim_bridge.experiments.search.statistics import Sample, dominates
+from sim_bridge.experiments.search.variants import (
     OFFLINE,
     REPLANNING,
     RESERVES,
@@ -54,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     reserves = compare_reserves(seeds, execution)
     better = beaten(OFFLINE, searches) + beaten(REPLANNING, replanning) + late(reserves)
     folder.mkdir(parents=True, exist_ok=True)
-    titles = {name: posed.title for name, posed in search_problems.problems().items()}
+    titles = {name: posed.title for name, posed in problems.problems().items()}
     tables = [
         sample_table(OFFLINE, searches, titles),
         sample_table(REPLANNING, replanning, WORLDS),
@@ -68,27 +70,25 @@ def run(arguments: argparse.Namespace) -> int:
         "better_than_the_default": better,
     })  # fmt: skip
     rows, choices = searches | replanning, (*OFFLINE, *REPLANNING)
-    search_figure.draw(folder / "search.png", choices, rows, titles | WORLDS)
+    figure.draw(folder / "search.png", choices, rows, titles | WORLDS)
     print(f"{text}\nresults in {folder}")
     for line in better:
         print(f"better than the default: {line}")
-    verdict = "FAILED" if better else "passed"
-    print(f"verdict: {verdict}: no value is better than the default of its option")
-    return 1 if better else 0
+    return print_verdict(not better, "no value is better than the default of its option")
 
 
 def compare_searches(seeds: list[int], execution: Execution) -> Rows:
     """Single searches with a budget of evaluations."""
 
-    def tasks(changes: dict[str, Any], problem: str) -> list[search_problems.Task]:
-        return [search_problems.Task(problem, "search", search_config(changes), seed) for seed in seeds]
+    def tasks(changes: dict[str, Any], problem: str) -> list[problems.Task]:
+        return [problems.Task(problem, "search", search_config(changes), seed) for seed in seeds]
 
     rows = [(c, value, problem) for c in OFFLINE for value in c.values for problem in c.problems]
     every = {(c.name, value, problem): tasks(c.values[value], problem) for c, value, problem in rows}
-    results = _results(search_problems.run_task, every, execution, "searches")
-    best = {name: posed.optimum or math.inf for name, posed in search_problems.problems().items()}
+    results = _results(problems.run_task, every, execution, "searches")
+    best = {name: posed.optimum or math.inf for name, posed in problems.problems().items()}
     for (_, _, problem), outcomes in results.items():
-        if not search_problems.problems()[problem].optimum:
+        if not problems.problems()[problem].optimum:
             best[problem] = min([best[problem], *(outcome.cost for outcome in outcomes)])
     found: Rows = {}
     for (choice, value, problem), outcomes in results.items():
@@ -103,9 +103,9 @@ def compare_searches(seeds: list[int], execution: Execution) -> Rows:
 def compare_replanning(seeds: list[int], execution: Execution) -> Rows:
     """Online VP-STO to the goal; the cost is the time until it is reached, relative to the seed's fastest."""
 
-    def tasks(changes: dict[str, Any], world: str) -> list[clutter_mpc_runs.Task]:
+    def tasks(changes: dict[str, Any], world: str) -> list[mpc_runs.Task]:
         config = online_config(changes)
-        return [clutter_mpc_runs.Task(config, "vpsto", START, world == "moving", seed) for seed in seeds]
+        return [mpc_runs.Task(config, "vpsto", START, world == "moving", seed) for seed in seeds]
 
     rows = [(c, value, world) for c in REPLANNING for value in c.values for world in WORLDS]
     every = {(c.name, value, world): tasks(c.values[value], world) for c, value, world in rows}
@@ -125,9 +125,9 @@ def compare_replanning(seeds: list[int], execution: Execution) -> Rows:
     return found
 
 
-def time_to_goal(task: clutter_mpc_runs.Task) -> tuple[float, float]:
+def time_to_goal(task: mpc_runs.Task) -> tuple[float, float]:
     """Time to the goal [s], inf if it is not reached or something is hit, and processor time of a step."""
-    result = clutter_mpc_runs.run_task(task)
+    result = mpc_runs.run_task(task)
     reached = result.time_to_goal if result.success and result.time_to_goal is not None else math.inf
     return reached, float(np.median(result.step_seconds))
 
@@ -135,8 +135,8 @@ def time_to_goal(task: clutter_mpc_runs.Task) -> tuple[float, float]:
 def compare_reserves(seeds: list[int], execution: Execution) -> dict[str, dict[str, Any]]:
     """How often a search comes back late, and how many iterations it gets done."""
     found = {}
-    tasks = {name: [search_deadline.DeadlineTask(name, seed) for seed in seeds] for name in RESERVES.values}
-    results = _results(search_deadline.run_task, tasks, execution, "deadlines")
+    tasks = {name: [deadline.DeadlineTask(name, seed) for seed in seeds] for name in RESERVES.values}
+    results = _results(deadline.run_task, tasks, execution, "deadlines")
     for name, outcomes in results.items():
         overrun = np.concatenate([outcome.overrun for outcome in outcomes])
         count = int((overrun > 0.0).sum())

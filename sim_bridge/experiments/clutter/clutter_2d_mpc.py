@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments.clutter_mpc_runs import PERIOD, Result, Task, run_task
-from sim_bridge.experiments.clutter_world import STARTS
-from sim_bridge.experiments.mppi import MppiConfig
+from sim_bridge.experiments.clutter.mpc_runs import PERIOD, Result, Task, run_task
+from sim_bridge.experiments.clutter.mppi import MppiConfig
+from sim_bridge.experiments.clutter.world import STARTS
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
+    print_verdict,
     quantile,
     run_trials,
     success_interval,
@@ -94,18 +95,17 @@ def _tasks(seeds: Sequence[int], *, sweep: bool) -> dict[str, list[Task]]:
 
 
 def _report(folder: pathlib.Path, groups: Groups, arguments: argparse.Namespace) -> int:
-    from sim_bridge.experiments import clutter_mpc_figures
+    from sim_bridge.experiments.clutter import mpc_figures
 
     summary = summarise(groups)
     write_summary(folder, {"experiment": "clutter_2d_mpc", "seed": arguments.seed, **summary})
     title = f"The cluttered plane at {1 / PERIOD:.0f} Hz, {arguments.runs} runs each"
     tables = "\n".join([results_table(summary), horizons_table(summary)])
     (folder / "table.md").write_text(f"# {title}\n\n{tables}")
-    clutter_mpc_figures.write(folder, groups, animation=not arguments.no_animation)
+    mpc_figures.write(folder, groups, animation=not arguments.no_animation)
     print(f"{title}\n\n{tables}\nresults in {folder}")
     missed = shortcomings(summary)
-    print("verdict: " + (f"FAILED: {'; '.join(missed)}" if missed else "passed: always at the goal, unhurt"))
-    return 1 if missed else 0
+    return print_verdict(not missed, "; ".join(missed) or "always at the goal, unhurt")
 
 
 def summarise(groups: Groups) -> dict[str, Any]:

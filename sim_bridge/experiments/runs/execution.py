@@ -1,11 +1,10 @@
-"""Running many seeded trials and saying what they show: parallel processes, confidence intervals, tables."""
+"""Running many seeded trials: in this process, in parallel ones or on a cluster; what is finished is kept."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import dataclasses
-import json
 import pathlib
 import re
 import reprlib
@@ -13,11 +12,10 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
-from sim_bridge.experiments.run_store import RunStore, fingerprint
-from sim_bridge.experiments.run_workers import Outcome, TrialError, in_processes, in_this_process, on_cluster
+from sim_bridge.experiments.runs.store import RunStore, fingerprint
+from sim_bridge.experiments.runs.workers import Outcome, TrialError, in_processes, in_this_process, on_cluster
 from vpsto_ros.exceptions import InvalidInputError
 
 
@@ -167,36 +165,3 @@ def describe(task: Any) -> str:
     if isinstance(task, dict) and "seed" in task:
         words.append(f"seed {task['seed']}")
     return ", ".join(words) or f"task {reprlib.repr(task)}"
-
-
-def success_interval(successes: int, runs: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a success rate."""
-    from scipy.stats import binomtest  # takes a second to load, which every worker would spend
-
-    interval = binomtest(successes, runs).proportion_ci(0.95, method="wilson")
-    return float(interval.low), float(interval.high)
-
-
-def quantile(values: Iterable[float | None], q: float) -> float | None:
-    """A quantile of the finite values, None if there are none."""
-    finite = [value for value in values if value is not None and np.isfinite(value)]
-    return float(np.quantile(finite, q)) if finite else None
-
-
-def write_summary(folder: pathlib.Path, summary: dict[str, Any]) -> pathlib.Path:
-    """Write summary.json into a folder, making it if need be."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "summary.json"
-    path.write_text(json.dumps(summary, indent=2) + "\n")
-    return path
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table that reads well both raw and rendered."""
-    widths = [max(len(str(cell)) for cell in column) for column in zip(header, *rows, strict=True)]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (str(cell).ljust(width) for cell, width in zip(cells, widths, strict=True))
-        return f"| {' | '.join(padded)} |"
-
-    return "\n".join([line(header), line(["-" * width for width in widths]), *map(line, rows)]) + "\n"

@@ -4,8 +4,8 @@ import pathlib
 
 import numpy as np
 
-from sim_bridge.experiments.search_statistics import Sample
-from sim_bridge.experiments.search_variants import Choice
+from sim_bridge.experiments.search.statistics import Sample
+from sim_bridge.experiments.search.variants import Choice
 
 COLUMNS = 5
 

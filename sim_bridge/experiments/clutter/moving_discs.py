@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL
 from vpsto_ros.collision.planar import MovingDisc, PlanarWorld, Stay
 from vpsto_ros.trajectory import Trajectory, TrajectoryBatch
 

@@ -12,9 +12,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS
-from sim_bridge.experiments.linear_program import optimal_duration
-from sim_bridge.experiments.via_points import ONE, SEVEN
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
+from sim_bridge.experiments.timing.linear_program import optimal_duration
+from sim_bridge.experiments.timing.via_points import ONE, SEVEN
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.vpsto import VpstoConfig, search

@@ -14,7 +14,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.runs import Execution, markdown_table, run_trials, write_summary
+from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
 from vpsto_ros.trajectory import (
     Limits,
     OptimalBasis,
@@ -162,11 +162,11 @@ def verdict(summary: dict) -> int:
         and all(medians[name] <= most for name, most in GAINS.items())
     )
     gains = ", ".join(f"{medians[name]:.3f} (at most {most:g}) {name}" for name, most in GAINS.items())
-    print(
-        f"verdict: {'passed' if good else 'FAILED'}: duration over that of equal spacing at most "
-        f"{summary['worst_ratio']:.6f}; median {gains}; {summary['limits_broken']} limits broken"
+    return print_verdict(
+        good,
+        f"duration over that of equal spacing at most {summary['worst_ratio']:.6f}; median {gains}; "
+        f"{summary['limits_broken']} limits broken",
     )
-    return 0 if good else 1
 
 
 def _table(rows: list[dict]) -> str:

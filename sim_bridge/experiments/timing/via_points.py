@@ -20,9 +20,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments import via_points_figure
-from sim_bridge.experiments.linear_program import optimal_duration
-from sim_bridge.experiments.runs import Execution, markdown_table, run_trials, write_summary
+from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
+from sim_bridge.experiments.timing import via_points_figure
+from sim_bridge.experiments.timing.linear_program import optimal_duration
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, time_key_positions
@@ -220,13 +220,12 @@ def verdict(summary: dict) -> int:
     gaps = [summary[key] for key in ("worst_gap_to_lp", "gap_7dof_n5", "gap_7dof_n10")]
     seconds = summary["seconds_7dof_n5_p50"]
     good = max(gaps) <= LARGEST_GAP and seconds <= MOST_SECONDS and summary["limits_broken"] == 0
-    print(
-        f"verdict: {'passed' if good else 'FAILED'}: worst gaps to the optimum {100 * gaps[0]:.3f} % (1-D), "
-        f"{100 * gaps[1]:.3f} % and {100 * gaps[2]:.3f} % (7 joints, 4 and 9 via-points), at most "
-        f"{100 * LARGEST_GAP:g} %; the first in {seconds:.3f} s, at most {MOST_SECONDS:g} s; "
-        f"{summary['limits_broken']} limits broken"
+    return print_verdict(
+        good,
+        f"worst gaps to the optimum {100 * gaps[0]:.3f} % (1-D), {100 * gaps[1]:.3f} % and "
+        f"{100 * gaps[2]:.3f} % (7 joints, 4 and 9 via-points), at most {100 * LARGEST_GAP:g} %; the first "
+        f"in {seconds:.3f} s, at most {MOST_SECONDS:g} s; {summary['limits_broken']} limits broken",
     )
-    return 0 if good else 1
 
 
 def _table(ones: list[Case], rows: dict[str, dict[str, float]]) -> str:

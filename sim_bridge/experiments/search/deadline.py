@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.search_problems import problems
+from sim_bridge.experiments.search.problems import problems
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sim_bridge.experiments import search_choices, search_deadline, search_problems, search_variants
-from sim_bridge.experiments.search_statistics import Sample, better, dominates, lower
+from sim_bridge.experiments.search import choices, deadline, problems, variants
+from sim_bridge.experiments.search.statistics import Sample, better, dominates, lower
 from vpsto_ros.optimization.vpsto import VpstoConfig
 
 
@@ -51,33 +51,33 @@ def test_a_value_dominates_only_if_it_costs_nothing_elsewhere():
     assert not dominates({"a": slow}, {"a": bad})
 
 
-@pytest.mark.parametrize("changes", [{}, {"population": 48, "starts": 2}, search_variants.CONVERGED])
+@pytest.mark.parametrize("changes", [{}, {"population": 48, "starts": 2}, variants.CONVERGED])
 def test_budgets_are_used_up_and_kept(changes):
     for name in ("line", "walls"):
-        budget = search_problems.problems()[name].budget
-        result = search_problems.run_task(
-            search_problems.Task(name, "", search_variants.search_config(changes), 1000)
+        budget = problems.problems()[name].budget
+        result = problems.run_task(
+            problems.Task(name, "", variants.search_config(changes), 1000)
         )
         assert budget - 96 < result.evaluations <= budget
 
 
 def test_every_option_is_compared_with_its_default():
-    for choice in (*search_variants.OFFLINE, *search_variants.REPLANNING, search_variants.RESERVES):
+    for choice in (*variants.OFFLINE, *variants.REPLANNING, variants.RESERVES):
         assert [not changes for changes in choice.values.values()].count(True) == 1
         assert len(choice.values) > 1
-    for choice in search_variants.OFFLINE:
-        configs = {search_variants.search_config(changes) for changes in choice.values.values()}
+    for choice in variants.OFFLINE:
+        configs = {variants.search_config(changes) for changes in choice.values.values()}
         assert len(configs) == len(choice.values) and VpstoConfig() in configs
-    for choice in search_variants.REPLANNING:
-        configs = [search_variants.online_config(changes) for changes in choice.values.values()]
-        assert len(set(configs)) == len(configs) and search_variants.ONLINE in configs
+    for choice in variants.REPLANNING:
+        configs = [variants.online_config(changes) for changes in choice.values.values()]
+        assert len(set(configs)) == len(configs) and variants.ONLINE in configs
         search = [config.online.search for config in configs]
-        assert {s.population * s.iterations for s in search} == {search_variants.STEP_EVALUATIONS}
+        assert {s.population * s.iterations for s in search} == {variants.STEP_EVALUATIONS}
 
 
 def test_keeping_time_free_trades_iterations_for_punctuality():
     rows = {
-        name: search_deadline.run_task(search_deadline.DeadlineTask(name, 1000))
+        name: deadline.run_task(deadline.DeadlineTask(name, 1000))
         for name in ("longest", "last", "none")
     }
     late = {name: float((row.overrun > 0).mean()) for name, row in rows.items()}
@@ -87,17 +87,17 @@ def test_keeping_time_free_trades_iterations_for_punctuality():
 
 @pytest.mark.parametrize(("default", "other", "verdict"), [(1.0, 1e-5, "passed"), (1e-5, 1.0, "FAILED")])
 def test_the_experiment_runs_and_can_fail(tmp_path, monkeypatch, capsys, default, other, verdict):
-    monkeypatch.setattr(search_variants, "SEARCH", VpstoConfig(sigma=default))
-    step_size = search_variants.Choice("step size", {"its own": {}, "other": {"sigma": other}}, ("line",))
+    monkeypatch.setattr(variants, "SEARCH", VpstoConfig(sigma=default))
+    step_size = variants.Choice("step size", {"its own": {}, "other": {"sigma": other}}, ("line",))
     nothing = {("N_max", "5"): {"standing": sample(np.zeros(12))}}
-    monkeypatch.setattr(search_choices, "OFFLINE", (step_size,))
-    monkeypatch.setattr(search_choices, "REPLANNING", (search_variants.Choice("N_max", {"5": {}}),))
-    monkeypatch.setattr(search_choices, "compare_replanning", lambda seeds, execution: nothing)
-    monkeypatch.setattr(search_deadline, "STEPS", 3)
+    monkeypatch.setattr(choices, "OFFLINE", (step_size,))
+    monkeypatch.setattr(choices, "REPLANNING", (variants.Choice("N_max", {"5": {}}),))
+    monkeypatch.setattr(choices, "compare_replanning", lambda seeds, execution: nothing)
+    monkeypatch.setattr(deadline, "STEPS", 3)
     arguments = argparse.Namespace(
         runs=12, seed=1000, out=str(tmp_path), jobs=1, scheduler=None, resume=False
     )
-    status = search_choices.run(arguments)
+    status = choices.run(arguments)
     last = capsys.readouterr().out.strip().splitlines()[-1]
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (tmp_path / "table.md").exists() and (tmp_path / "search.png").stat().st_size > 10_000

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.camera import CameraConfig
-from sim_bridge.experiments.pushing_loop import PushingLoop
+from sim_bridge.experiments.pushing.loop import PushingLoop
 from sim_bridge.scene import ObjectPlant, Scene
 from sim_bridge.simulation import Simulation
 from vpsto_ros.contact.geometry import PlanarShape

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments.pushing_loop import PushingLoop
-from sim_bridge.experiments.pushing_trials import Trial, TrialResult, run_trial, simulate, start_joints
+from sim_bridge.experiments.pushing.loop import PushingLoop
+from sim_bridge.experiments.pushing.trials import Trial, TrialResult, run_trial, simulate, start_joints
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
+    print_verdict,
     quantile,
     run_trials,
     success_interval,
@@ -122,7 +123,7 @@ class PushingExperiment:
     def _report(
         self, folder: pathlib.Path, trials: list[Trial], results: dict[str, list[TrialResult]]
     ) -> int:
-        from sim_bridge.experiments import pushing_figures
+        from sim_bridge.experiments.pushing import figures
 
         summaries = {name: summarise(runs) for name, runs in results.items()}
         first, *others = summaries
@@ -132,11 +133,10 @@ class PushingExperiment:
         titles = {variant.name: variant.title for variant in self.variants}
         table = results_table(titles, summaries)
         (folder / "table.md").write_text(f"# {self.title}\n\n{table}")
-        pushing_figures.write(folder, titles, trials, results)
+        figures.write(folder, titles, trials, results)
         print(f"{self.title}\n\n{table}\nresults in {folder}")
         missed = self.targets.missed(summaries[first])
-        print(f"verdict for '{titles[first]}': " + ("FAILED: " + "; ".join(missed) if missed else "passed"))
-        return 1 if missed else 0
+        return print_verdict(not missed, f"{titles[first]}: {'; '.join(missed) or 'all targets reached'}")
 
 
 def summarise(runs: list[TrialResult]) -> dict[str, Any]:

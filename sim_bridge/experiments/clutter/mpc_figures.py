@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.clutter_mpc_runs import Result
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS, draw_world
+from sim_bridge.experiments.clutter.mpc_runs import Result
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS, draw_world
 
 SHOWN = 5
 """Runs per controller in the figure; the thesis shows as many."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments.clutter_world import draw_world
+from sim_bridge.experiments.clutter.world import draw_world
 from vpsto_ros.optimization.costs import JointSpaceProblem
 
 COLOURS = {"LR": "tab:blue", "R": "tab:red", "LTR": "tab:green"}

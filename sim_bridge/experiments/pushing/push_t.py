@@ -10,8 +10,8 @@ import dataclasses
 
 import numpy as np
 
-from sim_bridge.experiments.pushing_experiment import PushingExperiment, Targets, Variant
-from sim_bridge.experiments.pushing_trials import Trial, random_plant
+from sim_bridge.experiments.pushing.experiment import PushingExperiment, Targets, Variant
+from sim_bridge.experiments.pushing.trials import Trial, random_plant
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.goal import wrap_angle

@@ -6,7 +6,7 @@ import pathlib
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.reach_cells import ReachTask
+from sim_bridge.experiments.reaching.cells import ReachTask
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere
 from vpsto_ros.robot.kinematics import forward_kinematics_batch

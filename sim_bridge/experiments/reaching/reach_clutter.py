@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments import reach_ompl
-from sim_bridge.experiments.reach_cells import ReachTask, random_task
-from sim_bridge.experiments.reach_figures import draw_solutions
-from sim_bridge.experiments.reach_online import run_online
+from sim_bridge.experiments.reaching import ompl_planner
+from sim_bridge.experiments.reaching.cells import ReachTask, random_task
+from sim_bridge.experiments.reaching.figures import draw_solutions
+from sim_bridge.experiments.reaching.online import run_online
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
+    print_verdict,
     quantile,
     run_trials,
     success_interval,
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run, print the table, draw some solutions; 0 if the figures are reached."""
     folder = pathlib.Path(arguments.out)
     execution = Execution.from_arguments(arguments)
-    compare = reach_ompl.available() and not arguments.no_compare
+    compare = ompl_planner.available() and not arguments.no_compare
     if not compare:
         print("without the comparison with OMPL" + ("" if arguments.no_compare else " (pip install ompl)"))
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
@@ -148,7 +149,7 @@ def bang_bang_duration(step: NDArray, limits: Limits) -> float:
 
 
 def _ompl(move: ReachTask, checker: ArmCollision, limits: Limits, solved: bool) -> dict[str, Any]:
-    plan = reach_ompl.plan_with_ompl(checker, limits, move.start, move.goal, seconds=OMPL_SECONDS)
+    plan = ompl_planner.plan_with_ompl(checker, limits, move.start, move.goal, seconds=OMPL_SECONDS)
     result = {
         "ompl_solved": plan.trajectory is not None,
         "ompl_path": plan.path is not None,
@@ -157,7 +158,7 @@ def _ompl(move: ReachTask, checker: ArmCollision, limits: Limits, solved: bool) 
         "unsolvable": False,
     }
     if not solved and plan.path is None:
-        again = reach_ompl.plan_with_ompl(
+        again = ompl_planner.plan_with_ompl(
             checker.with_margin(0.0), limits, move.start, move.goal, seconds=LAST_CHANCE
         )
         result["unsolvable"] = again.path is None
@@ -311,9 +312,9 @@ def _verdict(s: dict[str, Any]) -> int:
         and s["posture_checks_per_s"] >= RATE_WANTED
         and s["seconds_max"] <= 1.1 * SECONDS
     )
-    print(
-        f"verdict: {'passed' if good else 'FAILED'}: {100 * s['success_rate']:.1f} % solved (98 % wanted), "
-        f"{s['collisions']} in collision, longest search {s['seconds_max']:.2f} s, "
-        f"{s['posture_checks_per_s'] / 1e6:.2f} million posture checks a second"
+    return print_verdict(
+        good,
+        f"{100 * s['success_rate']:.1f} % solved (98 % wanted), {s['collisions']} in collision, longest "
+        f"search {s['seconds_max']:.2f} s, {s['posture_checks_per_s'] / 1e6:.2f} million posture checks a "
+        "second",
     )
-    return 0 if good else 1

@@ -13,15 +13,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.clutter_mpc_discs import (
+from sim_bridge.experiments.clutter.moving_discs import (
     BouncingDisc,
     DiscMargin,
     measured,
     random_discs,
     stays,
 )
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
-from sim_bridge.experiments.mppi import Mppi, MppiConfig, grown
+from sim_bridge.experiments.clutter.mppi import Mppi, MppiConfig, grown
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
 from vpsto_ros.collision.planar import MovingDisc
 from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig
 from vpsto_ros.planning.stitching import remainder

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments.clutter_world import draw_world
+from sim_bridge.experiments.clutter.world import draw_world
 
 SHOWN = 60
 COLOURS = {"with_prior": "tab:blue", "without_prior": "tab:orange"}
@@ -24,7 +24,7 @@ def write(path: pathlib.Path, outcomes: Mapping[tuple[str, str], Sequence[Any]])
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from sim_bridge.experiments.cholesky import STRATEGIES
+    from sim_bridge.experiments.clutter.cholesky import STRATEGIES
 
     figure, grid = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
     for row, strategy in zip(grid, STRATEGIES, strict=True):
@@ -39,7 +39,7 @@ def write(path: pathlib.Path, outcomes: Mapping[tuple[str, str], Sequence[Any]])
 
 def _paths(axes: Any, start: str, runs: Sequence[Any]) -> None:
     """Candidates of a first population, and what the runs found."""
-    from sim_bridge.experiments.cholesky import WORLD, prior, problem
+    from sim_bridge.experiments.clutter.cholesky import WORLD, prior, problem
 
     draw_world(axes, WORLD)
     plan = problem()

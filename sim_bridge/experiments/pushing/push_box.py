@@ -12,9 +12,9 @@ import dataclasses
 
 import numpy as np
 
-from sim_bridge.experiments.pushing_experiment import PushingExperiment, Targets, Variant
-from sim_bridge.experiments.pushing_trials import Trial, random_knock, random_plant
-from sim_bridge.experiments.straight_push import StraightPushScript
+from sim_bridge.experiments.pushing.experiment import PushingExperiment, Targets, Variant
+from sim_bridge.experiments.pushing.straight_push import StraightPushScript
+from sim_bridge.experiments.pushing.trials import Trial, random_knock, random_plant
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.planning.mpc import OnlineConfig
 from vpsto_ros.planning.pushing_config import PushingCosts, PushingMpcConfig

@@ -4,7 +4,7 @@ import pathlib
 
 import numpy as np
 
-from sim_bridge.experiments.pushing_trials import Trial, TrialResult
+from sim_bridge.experiments.pushing.trials import Trial, TrialResult
 
 
 def write(

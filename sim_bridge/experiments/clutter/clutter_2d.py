@@ -22,9 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments import clutter_2d_figure
-from sim_bridge.experiments.clutter_world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
-from sim_bridge.experiments.runs import Execution, markdown_table, quantile, run_trials, write_summary
+from sim_bridge.experiments.clutter import clutter_2d_figure
+from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
+from sim_bridge.experiments.runs import (
+    Execution,
+    markdown_table,
+    print_verdict,
+    quantile,
+    run_trials,
+    write_summary,
+)
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
@@ -179,7 +186,10 @@ def run(arguments: argparse.Namespace) -> int:
     (folder / "table.md").write_text(tables)
     print(f"{tables}\nresults in {folder}")
     known = given is None and np.array_equal(goal, GOAL)
-    return _verdict(shortcomings(results, arguments.runs, EXPECTED if known else {}))
+    missed = shortcomings(results, arguments.runs, EXPECTED if known else {})
+    return print_verdict(
+        not missed, "; ".join(missed) or "every run valid at every instant, durations and time as wanted"
+    )
 
 
 def _tasks(start: NDArray, goal: NDArray, n_via: int, config: VpstoConfig, seeds: range) -> list[Task]:
@@ -257,14 +267,6 @@ def shortcomings(results: dict[str, Any], runs: int, expected: dict[str, dict[st
         if (result["best_duration_more_via_points_s"] or np.inf) > longest:
             found.append(f"more via-points do not reach {longest} s from {name}")
     return found
-
-
-def _verdict(failures: list[str]) -> int:
-    if failures:
-        print("verdict: FAILED: " + "; ".join(failures))
-        return 1
-    print("verdict: passed: every run valid at every instant, durations and time as wanted")
-    return 0
 
 
 def class_table(results: dict[str, Any]) -> str:

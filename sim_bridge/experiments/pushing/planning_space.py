@@ -15,7 +15,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.runs import Execution, markdown_table, run_trials, write_summary
+from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
 from vpsto_ros.exceptions import InfeasibleError
 from vpsto_ros.planning.table_path import TablePath
 from vpsto_ros.planning.workspace import Workspace
@@ -66,8 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     (folder / "table.md").write_text(table)
     print(f"{table}\nresults in {folder}")
     good = rows["plane"]["within"] >= max(0.95, rows["joints"]["within"], rows["projected"]["within"] - 0.05)
-    print("verdict: " + ("passed" if good else "FAILED") + ": planning in the plane keeps the tool's height")
-    return 0 if good else 1
+    return print_verdict(good, "planning in the plane keeps the tool's height")
 
 
 def random_move(seed: int) -> dict[str, tuple[NDArray, float]]:

@@ -6,7 +6,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.reach_cells import ReachTask
+from sim_bridge.experiments.reaching.cells import ReachTask
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.shapes import Capsule, Shape, Sphere

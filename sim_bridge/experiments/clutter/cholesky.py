@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments import cholesky_figure
+from sim_bridge.experiments.clutter import cholesky_figure
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
+    print_verdict,
     run_trials,
     success_interval,
     write_summary,
@@ -154,12 +155,11 @@ def run(arguments: argparse.Namespace) -> int:
     (folder / "table.md").write_text(table)
     cholesky_figure.write(folder / "cholesky.png", outcomes)
     print(f"{table}\nresults in {folder}")
-    good = rate >= REQUIRED_RATE
-    print(
-        f"verdict: {'passed' if good else 'FAILED'}: with the prior, out of collision after {EARLY} "
-        f"iterations in {100 * rate:.0f} % of the runs (at least {100 * REQUIRED_RATE:.0f} %)"
+    return print_verdict(
+        rate >= REQUIRED_RATE,
+        f"with the prior, out of collision after {EARLY} iterations in {100 * rate:.0f} % of the runs "
+        f"(at least {100 * REQUIRED_RATE:.0f} %)",
     )
-    return 0 if good else 1
 
 
 def summarise(outcomes: list[Outcome], best: float) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""Pushing with one tool, in closed loop (4.5.2)."""

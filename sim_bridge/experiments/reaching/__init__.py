@@ -1,0 +1,1 @@
+"""The arm among obstacles, offline and online."""

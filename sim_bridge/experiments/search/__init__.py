@@ -1,0 +1,1 @@
+"""Every choice in the search against its alternatives."""
