@@ -1,13 +1,12 @@
 """CMA-ES and sep-CMA-ES against pycma, and their laws."""
 
-import dataclasses
-
 import cma
 import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.optimization.cma import STRATEGIES, CmaEs, default_parameters, has_collapsed, make_strategy
+from vpsto_ros.optimization.cma import STRATEGIES, CmaEs, has_collapsed, make_strategy
+from vpsto_ros.optimization.cma_parameters import default_parameters
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.trajectory import Limits, OptimalBasis
@@ -38,13 +37,11 @@ def different_powers(x):
 
 
 def iterations_to(
-    function, name, seed, *, dimension=6, population=16, target=1e-8, start=0.7, limit=2000, parameters=None
+    function, name, seed, *, dimension=6, population=16, target=1e-8, start=0.7, limit=2000, **options
 ):
-    strategy = make_strategy(
-        name, dimension, population, np.random.default_rng(seed), sigma=0.5, mean=np.full(dimension, start)
-    )
-    if parameters is not None:
-        strategy._parameters = parameters
+    mean = np.full(dimension, start)
+    rng = np.random.default_rng(seed)
+    strategy = make_strategy(name, dimension, population, rng, sigma=0.5, mean=mean, **options)
     for iteration in range(1, limit + 1):
         samples = strategy.ask()
         costs = function(samples)
@@ -55,32 +52,15 @@ def iterations_to(
 
 
 def pycma(dimension, population, rng, separable, start):
-    """The cma package itself, learning from good samples only as we do."""
+    """The cma package itself with its default options."""
     options = {
         "popsize": population,
-        "CMA_active": False,
         "CMA_diagonal": separable,
         "randn": lambda *shape: rng.standard_normal(shape),
         "seed": np.nan,
         "verbose": -9,
     }
     return cma.CMAEvolutionStrategy(np.full(dimension, start), 0.5, options)
-
-
-def pycma_constants(dimension, population, separable):
-    """Its learning rates in our symbols."""
-    reference = pycma(dimension, population, np.random.default_rng(0), separable, 1.0)
-    samples = np.array(reference.ask())
-    reference.tell(list(samples), sphere(samples).tolist())  # some constants are only set by the first update
-    p, step_size = reference.sp, reference.adapt_sigma
-    # Its separable variant multiplies the variances by powers of 2 instead of adding to them.
-    c_c, c_1, c_mu, rate = (p.cc_sep, p.c1_sep, p.cmu_sep, np.log(2)) if separable else (p.cc, p.c1, p.cmu, 1)
-    weights = np.array([weight for weight in p.weights if weight > 0])
-    return dataclasses.replace(
-        default_parameters(dimension, population, separable),
-        weights=weights / weights.sum(), mu_eff=p.weights.mueff, c_sigma=step_size.cs,
-        d_sigma=step_size.damps, c_c=c_c, c_1=rate * c_1, c_mu=rate * c_mu,
-    )  # fmt: skip
 
 
 def iterations_of_pycma(function, seed, separable, *, dimension, population, start, target=1e-8, limit=2000):
@@ -95,35 +75,81 @@ def iterations_of_pycma(function, seed, separable, *, dimension, population, sta
 
 
 def ratio_of(ours, theirs):
-    """Ratio of the geometric means of iterations, and its standard error (relative)."""
+    """Logarithm of the ratio of the geometric means of iterations, and its standard error."""
     a, b = np.log(ours), np.log(theirs)
-    error = np.sqrt(a.var(ddof=1) / len(a) + b.var(ddof=1) / len(b))
-    return np.exp(a.mean() - b.mean()), error
+    return a.mean() - b.mean(), np.sqrt(a.var(ddof=1) / len(a) + b.var(ddof=1) / len(b))
 
 
+SEEDS = range(20)
+SEPARABLE = (sphere, ellipsoid, cigar, tablet, different_powers)
 STANDARD = [
-    *((function, 6, 16) for function in (sphere, ellipsoid, cigar, tablet, different_powers, rosenbrock)),
-    *((function, 10, 12) for function in (sphere, tablet, different_powers)),
+    *((function, 6, 16, separable) for function in SEPARABLE for separable in (False, True)),
+    (rosenbrock, 6, 16, False),  # separably both need thousands of iterations along its valley
+    *((function, 10, 12, separable) for function in (tablet,) for separable in (False, True)),
 ]
 
 
-@pytest.mark.parametrize("separable", [False, True])
-@pytest.mark.parametrize(("function", "dimension", "population"), STANDARD)
-def test_needs_as_many_iterations_as_pycma(function, separable, dimension, population):
-    if separable and function is rosenbrock:
-        pytest.skip("its valley is not separable: both need thousands of iterations")
+@pytest.mark.parametrize(("function", "dimension", "population", "separable"), STANDARD)
+def test_needs_as_many_iterations_as_pycma(function, dimension, population, separable):
     size = {"dimension": dimension, "population": population, "start": 0.0 if function is rosenbrock else 0.7}
-    name, seeds = "sep-cma" if separable else "cma", range(6)
-    theirs = [iterations_of_pycma(function, seed, separable, **size) for seed in seeds]
+    theirs = [iterations_of_pycma(function, seed, separable, **size) for seed in SEEDS]
     assert max(theirs) < 2000
-    constants = pycma_constants(dimension, population, separable)
-    same = [iterations_to(function, name, seed, parameters=constants, **size)[0] for seed in seeds]
-    ratio, error = ratio_of(same, theirs)
-    # Equal constants: the same algorithm but for the form of the separable update, within three errors.
-    assert abs(np.log(ratio)) < (0.08 if separable else 0.02) + 3 * error
-    # Our own constants, those of the tutorial: never slower.
-    ratio, error = ratio_of([iterations_to(function, name, seed, **size)[0] for seed in seeds], theirs)
-    assert np.log(ratio) < 0.02 + 3 * error
+    name = "sep-cma" if separable else "cma"
+    # Both end at the only point where the function is below the target.
+    ours = [iterations_to(function, name, seed, **size)[0] for seed in SEEDS]
+    ratio, error = ratio_of(ours, theirs)
+    assert error < 0.05
+    # Measured: full 0.97 to 1.02; separable, which is another rule in pycma, 0.92 to 1.00.
+    assert -(0.08 if separable else 0.02) - 3 * error < ratio < 0.02 + 3 * error
+
+
+@pytest.mark.parametrize("function", [tablet, cigar])
+def test_separable_needs_no_more_iterations_than_pycma_in_many_dimensions(function):
+    size, seeds = {"dimension": 28, "population": 25, "start": 0.7}, range(4)
+    theirs = [iterations_of_pycma(function, seed, True, **size) for seed in seeds]
+    ratio, error = ratio_of([iterations_to(function, "sep-cma", seed, **size)[0] for seed in seeds], theirs)
+    assert ratio < 0.02 + 3 * error
+
+
+@pytest.mark.parametrize(("separable", "gain"), [(False, 1.3), (True, 1.03)])
+def test_bad_samples_teach_something(separable, gain):
+    name = "sep-cma" if separable else "cma"
+    with_them, without = (
+        [iterations_to(tablet, name, seed, dimension=10, population=12, active=active)[0] for seed in SEEDS]
+        for active in (True, False)
+    )
+    ratio, error = ratio_of(without, with_them)
+    assert ratio - 3 * error > np.log(gain)
+
+
+@pytest.mark.parametrize(("dimension", "population"), [(3, 12), (6, 16), (10, 12), (20, 10)])
+def test_the_constants_are_those_of_pycma(dimension, population):
+    reference = pycma(dimension, population, np.random.default_rng(0), False, 1.0)
+    samples = np.array(reference.ask())
+    reference.tell(list(samples), sphere(samples).tolist())  # some constants are only set by the first update
+    p, theirs = default_parameters(dimension, population, False), reference.sp
+    step_size = reference.adapt_sigma
+    np.testing.assert_allclose(p.weights, theirs.weights, atol=1e-12)
+    assert p.mu == theirs.weights.mu and p.mu_eff == pytest.approx(theirs.weights.mueff)
+    found = [p.c_sigma, p.d_sigma, p.c_c, p.c_1, p.c_mu]
+    np.testing.assert_allclose(found, [step_size.cs, step_size.damps, theirs.cc, theirs.c1, theirs.cmu])
+
+
+@pytest.mark.parametrize(("dimension", "population"), [(6, 16), (3, 12)])
+def test_told_the_same_it_becomes_what_pycma_becomes(dimension, population):
+    reference = pycma(dimension, population, np.random.default_rng(1), False, 0.7)
+    samples = np.array(reference.ask())
+    ours = CmaEs(dimension, population, np.random.default_rng(0), sigma=0.5, mean=np.full(dimension, 0.7))
+    ours._covariance = reference.sm.C.copy()  # which is not exactly the identity
+    ours._decompose()
+    for _ in range(10):
+        costs = ellipsoid(samples)
+        reference.tell(list(samples), costs.tolist())
+        ours.tell(samples, costs)
+        samples = np.array(reference.ask())
+        np.testing.assert_allclose(ours.mean, reference.mean, rtol=1e-6)
+        np.testing.assert_allclose(ours._covariance, reference.sm.C, rtol=1e-6, atol=1e-6)
+        assert ours.sigma == pytest.approx(reference.sigma, rel=1e-6)
 
 
 PLANE = Limits(np.full(2, 1.0), np.full(2, 2.0), np.full(2, -0.6), np.full(2, 1.2))
@@ -149,21 +175,24 @@ def test_agrees_with_pycma_on_trajectories(move, ours, theirs):
     prior = problem.prior(spread=0.2)
 
     def runs(strategy):
-        config = VpstoConfig(strategy=strategy, population=24, iterations=300, restarts=0)
-        return [search(prior, problem.evaluate, config, np.random.default_rng(seed)) for seed in range(5)]
+        config = VpstoConfig(strategy=strategy, population=24, iterations=100, restarts=0)
+        return [search(prior, problem.evaluate, config, np.random.default_rng(seed)) for seed in SEEDS]
 
     found = {strategy: runs(strategy) for strategy in (ours, theirs)}
     costs = {strategy: [result.cost for result in results] for strategy, results in found.items()}
-    assert min(costs[ours]) == pytest.approx(min(costs[theirs]), rel=2e-3)
-    assert np.median(costs[ours]) < 1.005 * np.median(costs[theirs])
-    target = 1.01 * max(costs[ours] + costs[theirs])
+    best = min(costs[ours] + costs[theirs])
+    assert min(costs[ours]) == pytest.approx(best, rel=2e-3)
+    assert np.median(costs[ours]) < 1.002 * np.median(costs[theirs])
 
     def taken(result):
-        return 1 + next(k for k, entry in enumerate(result.history) if entry.best_valid_cost < target)
+        below = (k for k, entry in enumerate(result.history, 1) if entry.best_valid_cost < 1.01 * result.cost)
+        return next(below)
 
     ratio, error = ratio_of(*([taken(result) for result in found[strategy]] for strategy in (ours, theirs)))
-    # pycma also learns from bad samples, which makes it a little faster.
-    assert np.log(ratio) < np.log(1.1) + 3 * error
+    assert error < 0.1
+    # In 14 dimensions pycma damps the step size of 24 samples more than the tutorial does, and is slower.
+    least = -(0.4 if move == "seven joints" else 0.1 if ours == "sep-cma" else 0.03)
+    assert least - 3 * error < ratio < 0.03 + 3 * error
 
 
 def test_the_same_optimum_is_found():
@@ -186,8 +215,10 @@ def test_the_covariance_becomes_the_inverse_hessian():
 
 def test_default_parameters_follow_the_tutorial():
     p = default_parameters(10, 10, False)
-    assert p.weights.size == 5 and p.weights.sum() == pytest.approx(1.0)
+    assert p.mu == 5 and p.weights[:5].sum() == pytest.approx(1.0)
     assert np.all(np.diff(p.weights) < 0)
+    assert p.c_1 + p.c_mu * p.weights.sum() == pytest.approx(0.0)  # nothing is forgotten
+    np.testing.assert_array_equal(default_parameters(10, 10, False, active=False).weights[5:], 0.0)
     assert p.mu_eff == pytest.approx(3.167, abs=0.01)  # pycma's value for popsize 10
     separable = default_parameters(10, 10, True)
     assert separable.c_1 == pytest.approx(p.c_1 * 4)
@@ -197,6 +228,8 @@ def test_default_parameters_follow_the_tutorial():
         for population in (4, 500):
             q = default_parameters(dimension, population, True)
             assert 0 <= q.c_mu <= 1 - q.c_1 <= 1
+            negative = -q.weights[q.mu :].sum()
+            assert 0 <= dimension * q.c_mu * negative <= (1 - q.c_1 - q.c_mu) * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("separable", [False, True])
@@ -217,6 +250,66 @@ def test_bad_costs_rank_last_and_leave_no_trace(name):
         strategy.tell(samples, costs)
     assert sphere(strategy.mean) < 1e-3
     assert np.isfinite(strategy.covariance_diagonal).all() and np.isfinite(strategy.sigma)
+
+
+def covariance(strategy):
+    return np.diag(strategy._covariance) if strategy.separable else strategy._covariance
+
+
+@pytest.mark.parametrize("separable", [False, True])
+@pytest.mark.parametrize("population", [5, 8, 32])
+@pytest.mark.parametrize("dimension", [1, 2, 6, 28, 60, 150])
+def test_the_covariance_stays_positive_definite_at_worst(dimension, population, separable):
+    """All bad samples lie in one direction, until the eigenvectors are computed anew."""
+    strategy = CmaEs(dimension, population, np.random.default_rng(0), separable=separable)
+    good = population // 2
+    for _ in range(int(strategy._parameters.lazy_gap) + 1):
+        samples = np.zeros((population, dimension))
+        samples[good:, 0] = 30.0
+        strategy.tell(strategy.mean + samples, np.arange(population, dtype=float))
+        assert np.linalg.eigvalsh(covariance(strategy))[0] > 1e-5
+
+
+@pytest.mark.parametrize("separable", [False, True])
+def test_the_covariance_stays_positive_definite_with_few_finite_costs(separable):
+    rng = np.random.default_rng(0)
+    strategy = CmaEs(8, 16, rng, separable=separable)
+    for _ in range(300):
+        samples = strategy.ask()
+        samples[:2] += 100.0 * rng.standard_normal((2, 8))
+        costs = rng.standard_normal(16)
+        costs[rng.permutation(16)[: rng.integers(0, 17)]] = np.nan
+        strategy.tell(samples, costs, injected=2)
+        values = np.linalg.eigvalsh(covariance(strategy))
+        assert values[0] > 1e-9 * values[-1] and np.isfinite(strategy.sigma)
+
+
+@pytest.mark.parametrize("separable", [False, True])
+def test_the_length_of_a_bad_step_does_not_matter(separable):
+    results = []
+    for length in (1e-3, 1.0, 1e3):
+        strategy = CmaEs(5, 10, np.random.default_rng(0), separable=separable)
+        samples = strategy.ask()
+        samples[5:] *= length
+        strategy.tell(samples, np.arange(10.0))
+        results.append(covariance(strategy))
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(results[2], results[1], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("separable", [False, True])
+def test_a_bad_direction_loses_variance_unless_it_is_an_injected_one(separable):
+    def variance(injected, active=True):
+        strategy = CmaEs(4, 8, np.random.default_rng(0), separable=separable, active=active)
+        samples = np.zeros((8, 4))
+        samples[:4, 0] = 1.0
+        samples[4:, 1] = 1.0
+        costs = np.array([4.0, 5.0, 6.0, 7.0, 0.0, 1.0, 2.0, 3.0])
+        strategy.tell(samples, costs, injected)
+        return covariance(strategy)[0, 0] / covariance(strategy)[2, 2]
+
+    assert variance(0) < variance(2) < 1 - 1e-3
+    assert variance(4) == pytest.approx(1.0) == variance(0, active=False)
 
 
 @pytest.mark.parametrize("name", ["cma", "sep-cma"])

@@ -1,25 +1,27 @@
 """Evolution strategies with covariance matrix adaptation, vectorised for small populations and short loops.
 
-:class:`CmaEs` is CMA-ES with positive recombination weights and the default parameters of Hansen, "The CMA
-Evolution Strategy: A Tutorial" (2016), and its separable variant with the learning rates of Ros and Hansen
+:class:`CmaEs` is active CMA-ES, that of Hansen, "The CMA Evolution Strategy: A Tutorial" (2016), which also
+learns from the worse half of its samples, and its separable variant with the learning rates of Ros and Hansen
 (2008). External solutions are accepted as in Hansen, "Injecting external solutions into CMA-ES" (2011).
 :class:`PycmaEs` is the same interface on the ``cma`` package, kept as a choice and as the reference in the
 tests.
 """
 
-import dataclasses
-import functools
 import math
 from typing import Any, Protocol
 
 import numpy as np
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+from vpsto_ros.optimization.cma_parameters import default_parameters
 
 STRATEGIES = ("sep-cma", "cma", "pycma", "pycma-sep")
 _SIGMA_RANGE = (1e-30, 1e30)
 _LARGEST_CONDITION = 1e14
 """Of the covariance; beyond it the short axes are round-off (the same constant as in pycma)."""
+
+_TINY = 1e-300
+"""Keeps divisions by the length of a step defined."""
 
 _RESOLUTION = 1e-12
 """Standard deviation, relative to max(1, |mean|), below which samples hardly differ any more."""
@@ -51,52 +53,17 @@ def has_collapsed(strategy: Strategy) -> bool:
     return strategy.sigma**2 * float(strategy.covariance_diagonal.max()) < finest**2
 
 
-@dataclasses.dataclass(frozen=True)
-class StrategyParameters:
-    """Hansen's default parameters for a dimension and a population size, in the symbols of the tutorial."""
-
-    weights: np.ndarray
-    mu_eff: float
-    c_sigma: float
-    d_sigma: float
-    c_c: float
-    c_1: float
-    c_mu: float
-    chi: float
-    lazy_gap: float
-
-
-@functools.lru_cache(maxsize=256)
-def default_parameters(dimension: int, population: int, separable: bool) -> StrategyParameters:
-    """Recombination weights and learning rates.
-
-    Args:
-        dimension: number of variables D.
-        population: number of samples per iteration M.
-        separable: scale c_1 and c_mu by (D + 2) / 3, because only D variances are learned.
-    """
-    n = dimension
-    raw = math.log((population + 1) / 2) - np.log(np.arange(1, population // 2 + 1))
-    weights = raw / raw.sum()
-    weights.flags.writeable = False
-    mu_eff = float(1.0 / np.square(weights).sum())
-    c_sigma = (mu_eff + 2) / (n + mu_eff + 5)
-    d_sigma = 1 + 2 * max(0.0, math.sqrt((mu_eff - 1) / (n + 1)) - 1) + c_sigma
-    c_c = (4 + mu_eff / n) / (n + 4 + 2 * mu_eff / n)
-    faster = (n + 2) / 3 if separable else 1.0
-    c_1 = min(1.0, faster * 2 / ((n + 1.3) ** 2 + mu_eff))
-    c_mu = min(1 - c_1, faster * 2 * (0.25 + mu_eff + 1 / mu_eff - 2) / ((n + 2) ** 2 + mu_eff))
-    chi = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
-    # The eigenvectors change little within this many iterations; the same constant as in pycma.
-    lazy_gap = 0.5 / (n * (c_1 + c_mu))
-    return StrategyParameters(weights, mu_eff, c_sigma, d_sigma, c_c, c_1, c_mu, chi, lazy_gap)
-
-
 class CmaEs:
     """CMA-ES (full covariance) or sep-CMA-ES (diagonal covariance), minimising.
 
     The samples of an iteration are x_i = m + sigma y_i with y_i ~ N(0, C). ``sigma`` may be changed between
     iterations.
+
+    The full strategy is the one of the ``cma`` package with its default options and needs as many iterations.
+    The separable strategy updates C alike, eq. (47) of the tutorial on the diagonal. The package multiplies
+    the variances by exponentials instead, with lower learning rates in more dimensions and without
+    normalising bad steps: another rule, compared with which this one needs as many iterations in 6 to 10
+    dimensions and up to 15 % fewer in 28.
 
     Args:
         dimension: number of variables D >= 1.
@@ -105,6 +72,7 @@ class CmaEs:
         sigma: initial step size, > 0.
         mean: initial mean, shape (D,); zeros by default.
         separable: adapt the diagonal of C only.
+        active: learn from the worse half of the samples, too: their directions lose variance.
 
     Raises:
         InvalidInputError: a size or the step size is out of range, or the mean has the wrong shape or is not
@@ -120,6 +88,7 @@ class CmaEs:
         sigma: float = 1.0,
         mean: np.ndarray | None = None,
         separable: bool = False,
+        active: bool = True,
     ) -> None:
         self._mean = _checked_mean(dimension, population, sigma, mean)
         self.sigma = float(sigma)
@@ -127,7 +96,7 @@ class CmaEs:
         self.population = population
         self.iterations = 0
         self._rng = rng
-        self._parameters = default_parameters(dimension, population, separable)
+        self._parameters = default_parameters(dimension, population, separable, active)
         self._path_sigma = np.zeros(dimension)
         self._path_c = np.zeros(dimension)
         self._scales = np.ones(dimension)
@@ -158,51 +127,63 @@ class CmaEs:
         Args:
             samples: what was evaluated, shape (M, D): the result of :meth:`ask`, in which the first rows may
                 have been replaced by solutions from elsewhere.
-            costs: shape (M,). Non-finite costs rank last and never contribute; if none is finite nothing is
-                learned. Nothing is learned either once the distribution :func:`has_collapsed`.
+            costs: shape (M,). Non-finite costs rank last and never contribute, not even as bad samples; if
+                none is finite nothing is learned. Nothing is learned either once the distribution
+                :func:`has_collapsed`.
             injected: number of leading rows that did not come from :meth:`ask`. Their steps are shortened to
                 a length the distribution could have drawn, so that a distant one cannot blow up the
-                covariance.
+                covariance. They count as good samples only: a bad one says nothing about the distribution.
         """
         self.iterations += 1
-        order, weights, mu_eff = self._select(costs)
-        if not weights.size or has_collapsed(self):
+        finite = np.isfinite(costs)
+        if not finite.all():
+            samples, costs, injected = samples[finite], costs[finite], int(finite[:injected].sum())
+        if not costs.size or has_collapsed(self):
             return
-        steps = (samples[order] - self._mean) / self.sigma
+        p = self._parameters
+        order = costs.argsort(kind="stable")
+        steps = samples[order]
+        steps -= self._mean
+        steps /= self.sigma
+        weights, mu_eff = self._weights(costs.size)
         if injected:
-            self._shorten(steps, order < injected)
-        step = weights @ steps
+            external = order < injected
+            self._shorten(steps, external)
+            weights = np.where(external, np.maximum(weights, 0.0), weights)
+        step = weights[: p.mu] @ steps[: p.mu]
         self._mean = self._mean + self.sigma * step
         length, stalled = self._update_paths(step, mu_eff)
         self._update_covariance(steps, weights, stalled)
-        p = self._parameters
         self.sigma *= math.exp(min(1.0, (p.c_sigma / p.d_sigma) * (length / p.chi - 1)))
         self.sigma = min(max(self.sigma, _SIGMA_RANGE[0]), _SIGMA_RANGE[1])
 
-    def _select(self, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Indices of the best samples, their weights and the effective number of them."""
+    def _weights(self, count: int) -> tuple[np.ndarray, float]:
+        """Weights of the ranks when there are so many samples, and the effective number of good ones."""
         p = self._parameters
-        finite = np.isfinite(costs)
-        count = int(np.count_nonzero(finite))
-        if count < costs.size:
-            costs = np.where(finite, costs, np.inf)
-        order = np.argsort(costs, kind="stable")[: p.weights.size]
-        if count >= p.weights.size:
-            return order, p.weights, p.mu_eff
-        weights = p.weights[:count] / p.weights[:count].sum() if count else p.weights[:0]
-        return order[:count], weights, 1.0 / float(weights @ weights) if count else 0.0
+        if count >= p.mu:
+            return p.weights[:count], p.mu_eff
+        weights = p.weights[:count] / p.weights[:count].sum()
+        return weights, 1.0 / float(weights @ weights)
 
     def _shorten(self, steps: np.ndarray, rows: np.ndarray) -> None:
         n = self._mean.size
         longest = math.sqrt(n) + 2 * n / (n + 2)
-        lengths = np.linalg.norm(self._whiten(steps[rows]), axis=1)
-        steps[rows] *= np.minimum(1.0, longest / np.maximum(lengths, 1e-300))[:, None]
+        lengths = np.sqrt(self._squared_lengths(steps[rows]))
+        steps[rows] *= np.minimum(1.0, longest / np.maximum(lengths, _TINY))[:, None]
 
     def _whiten(self, steps: np.ndarray) -> np.ndarray:
         """C^{-1/2} y for steps in the last axis."""
         if self._basis is None:
             return steps / self._scales
         return ((steps @ self._basis) / self._scales) @ self._basis.T
+
+    def _squared_lengths(self, steps: np.ndarray) -> np.ndarray:
+        """||C^{-1/2} y||^2 of every row."""
+        if self._basis is None:
+            return (steps * steps) @ (1.0 / self._scales**2)
+        white = steps @ self._basis
+        white *= white
+        return white @ (1.0 / self._scales**2)
 
     def _update_paths(self, step: np.ndarray, mu_eff: float) -> tuple[float, bool]:
         p = self._parameters
@@ -218,24 +199,34 @@ class CmaEs:
         return length, stalled
 
     def _update_covariance(self, steps: np.ndarray, weights: np.ndarray, stalled: bool) -> None:
-        p = self._parameters
-        kept = 1 - p.c_1 - p.c_mu + (p.c_1 * p.c_c * (2 - p.c_c) if stalled else 0.0)
+        """Eq. (47) of the tutorial. Bad steps are scaled to the Mahalanobis length sqrt(n), eq. (46)."""
+        p, n = self._parameters, self._mean.size
+        rates = p.c_mu * weights
+        kept = 1 - p.c_1 - float(np.add.reduce(rates))
+        if stalled:
+            kept += p.c_1 * p.c_c * (2 - p.c_c)
         if self.separable:
-            self._covariance = kept * self._covariance
-            self._covariance += p.c_1 * self._path_c**2 + p.c_mu * (weights @ steps**2)
+            squares = steps * steps
+            rates[p.mu :] *= n / (squares[p.mu :] @ (1.0 / self._covariance) + _TINY)
+            self._covariance = kept * self._covariance + p.c_1 * self._path_c**2 + rates @ squares
             np.maximum(self._covariance, self._covariance.max() / _LARGEST_CONDITION, out=self._covariance)
             self._scales = np.sqrt(self._covariance)
             return
-        rank_mu = (steps.T * (p.c_mu * weights)) @ steps
+        rates[p.mu :] *= n / (self._squared_lengths(steps[p.mu :]) + _TINY)
+        rank_mu = (steps.T * rates) @ steps
         self._covariance = kept * self._covariance + rank_mu + (p.c_1 * self._path_c)[:, None] * self._path_c
         self._since_decomposition += 1
         if self._since_decomposition > p.lazy_gap:
             self._decompose()
 
     def _decompose(self) -> None:
-        values, self._basis = np.linalg.eigh(self._covariance)
-        # Round-off can push the smallest eigenvalue of an ill-conditioned matrix below zero.
-        self._scales = np.sqrt(np.maximum(values, values[-1] / _LARGEST_CONDITION))
+        values, basis = np.linalg.eigh(self._covariance)
+        smallest = values[-1] / _LARGEST_CONDITION
+        if values[0] < smallest:
+            # Round-off can push the smallest eigenvalue of an ill-conditioned matrix below zero.
+            values = np.maximum(values, smallest)
+            self._covariance = (basis * values) @ basis.T
+        self._basis, self._scales = basis, np.sqrt(values)
         self._since_decomposition = 0
 
 
@@ -255,12 +246,14 @@ class PycmaEs:
         sigma: float = 1.0,
         mean: np.ndarray | None = None,
         separable: bool = False,
+        active: bool = True,
     ) -> None:
         import cma  # imported here because it takes more than a second and is optional
 
         start = _checked_mean(dimension, population, sigma, mean)
         options = {
             "popsize": population,
+            "CMA_active": active,
             "CMA_diagonal": separable,
             "randn": lambda *shape: rng.standard_normal(shape),
             "seed": math.nan,  # do not touch NumPy's global generator
