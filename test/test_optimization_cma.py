@@ -7,7 +7,7 @@ import pytest
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.optimization.cma import STRATEGIES, CmaEs, has_collapsed, make_strategy
 from vpsto_ros.optimization.cma_parameters import default_parameters
-from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
+from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.trajectory import Limits, OptimalBasis
 
@@ -153,11 +153,7 @@ def test_told_the_same_it_becomes_what_pycma_becomes(dimension, population):
 
 
 PLANE = Limits(np.full(2, 1.0), np.full(2, 2.0), np.full(2, -0.6), np.full(2, 1.2))
-SLOW = Limits(np.array([0.1]), np.array([0.2]))
 MOVES = {
-    "a line as fast as possible": JointSpaceProblem(
-        OptimalBasis.uniform(4), SLOW, np.zeros(1), np.ones(1), weights=CostWeights(smoothness=0.0)
-    ),
     "round a disc": JointSpaceProblem(
         OptimalBasis.uniform(3), PLANE, np.zeros(2), np.array([1.0, 0.0]),
         collision=lambda q: np.hypot(q[..., 0] - 0.5, q[..., 1] + 0.05) < 0.3,
