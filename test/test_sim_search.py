@@ -85,7 +85,7 @@ def test_keeping_time_free_trades_iterations_for_punctuality():
     assert late["longest"] <= late["last"] < late["none"] and done["longest"] <= done["last"] < done["none"]
 
 
-@pytest.mark.parametrize(("default", "other", "verdict"), [(1.0, 1e-5, "passed"), (1e-5, 1.0, "FAILED")])
+@pytest.mark.parametrize(("default", "other", "verdict"), [(1.0, 1e-6, "passed"), (1e-6, 1.0, "FAILED")])
 def test_the_experiment_runs_and_can_fail(tmp_path, monkeypatch, capsys, default, other, verdict):
     monkeypatch.setattr(variants, "SEARCH", VpstoConfig(sigma=default))
     step_size = variants.Choice("step size", {"its own": {}, "other": {"sigma": other}}, ("line",))
