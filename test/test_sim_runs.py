@@ -51,6 +51,22 @@ def dies_once(task):
     return random_sum(seed)
 
 
+WARM_UPS = []
+
+
+def warms_up():
+    WARM_UPS.append(os.getpid())
+
+
+def fails_to_warm_up():
+    raise ValueError("no compiler")
+
+
+def number_of_warm_ups(task):
+    """In this process, as of now."""
+    return os.getpid(), WARM_UPS.count(os.getpid()), task
+
+
 def ran(folder):
     """The seeds that were run since this was asked last, sorted."""
     log = folder / "log"
@@ -78,6 +94,28 @@ def test_the_number_of_processes_changes_no_bit():
 def test_a_cluster_gives_the_same_results(scheduler):
     alone = run_trials(random_sum, range(6), Execution(), "alone")
     assert run_trials(random_sum, range(6), Execution(scheduler=scheduler), "cluster") == alone
+
+
+def test_every_process_warms_up_once_before_its_first_run(scheduler):
+    for execution in (Execution(), Execution(jobs=2), Execution(scheduler=scheduler)):
+        for label in ("first", "second"):
+            told = run_trials(number_of_warm_ups, range(6), execution, label, warm_up=warms_up)
+            assert [task for *_, task in told] == list(range(6))
+            assert {warmed for _, warmed, _ in told} == {1}, execution
+            assert (os.getpid() in {process for process, *_ in told}) == (execution == Execution())
+
+
+def test_without_a_run_nothing_is_warmed_up(tmp_path):
+    assert run_trials(random_sum, [], Execution(), "none", warm_up=fails_to_warm_up) == []
+    expected = run_trials(random_sum, [1], Execution(folder=tmp_path), "one")
+    resumed = Execution(folder=tmp_path, resume=True)
+    assert run_trials(random_sum, [1], resumed, "one", warm_up=fails_to_warm_up) == expected
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_warm_up_that_fails_is_an_error_of_the_run(jobs):
+    with pytest.raises(TrialError, match=r"(?s)seed \d failed: ValueError: no compiler.*in fails_to_warm_up"):
+        run_trials(random_sum, range(2), Execution(jobs=jobs), "a", warm_up=fails_to_warm_up)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

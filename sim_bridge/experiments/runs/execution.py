@@ -15,7 +15,14 @@ from typing import Any
 from tqdm import tqdm
 
 from sim_bridge.experiments.runs.store import RunStore, fingerprint
-from sim_bridge.experiments.runs.workers import Outcome, TrialError, in_processes, in_this_process, on_cluster
+from sim_bridge.experiments.runs.workers import (
+    Outcome,
+    TrialError,
+    Work,
+    in_processes,
+    in_this_process,
+    on_cluster,
+)
 from vpsto_ros.exceptions import InvalidInputError
 
 
@@ -70,13 +77,13 @@ class Execution:
         return store
 
     def outcomes(
-        self, trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
+        self, work: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
     ) -> Generator[tuple[int, Outcome]]:
         """Outcomes with the indices of their tasks, as they come."""
         if self.scheduler is not None:
-            return on_cluster(trial, tasks, self.scheduler)
+            return on_cluster(work, tasks, self.scheduler)
         jobs = min(self.jobs or _cores(), len(tasks))
-        return in_this_process(trial, tasks) if jobs <= 1 else in_processes(trial, tasks, jobs)
+        return in_this_process(work, tasks) if jobs <= 1 else in_processes(work, tasks, jobs)
 
 
 def _cores() -> int:
@@ -86,7 +93,11 @@ def _cores() -> int:
 
 
 def run_trials(
-    trial: Callable[[Any], Any], tasks: Iterable[Any], execution: Execution, label: str
+    trial: Callable[[Any], Any],
+    tasks: Iterable[Any],
+    execution: Execution,
+    label: str,
+    warm_up: Callable[[], Any] | None = None,
 ) -> list[Any]:
     """Results of `trial(task)` in the order of the tasks; the same wherever they are computed.
 
@@ -99,6 +110,9 @@ def run_trials(
         tasks: arguments, picklable; each carries its seed.
         execution: where.
         label: what the progress bar says, and the name of the record.
+        warm_up: a function at module level that uses what the trials use for a moment. Every process that
+            computes runs, this one or a worker, calls it once before its first, so that compiling and
+            loading never count in the times that trials measure. It changes no result.
 
     Raises:
         TrialError: naming the task of the run that failed.
@@ -114,7 +128,7 @@ def run_trials(
         results = _taken_over(store, keys, execution, label)
         todo = [(index, task) for index, task in enumerate(tasks) if index not in results]
         bar = stack.enter_context(tqdm(desc=label, total=len(tasks), initial=len(results), disable=None))
-        outcomes = stack.enter_context(contextlib.closing(execution.outcomes(trial, todo)))
+        outcomes = stack.enter_context(contextlib.closing(execution.outcomes(Work(trial, warm_up), todo)))
         try:
             for index, outcome in outcomes:
                 if outcome.error is not None:

@@ -1,7 +1,7 @@
 """Where trials run: in this process, in processes of this machine (joblib), or on a Dask cluster.
 
 Each of the three is a generator of ``(index, Outcome)`` in the order in which runs finish. A worker does one
-trial at a time with one BLAS thread, so that the place changes no result.
+trial at a time with one BLAS thread, so that the place changes no result; before its first, it warms up.
 """
 
 from __future__ import annotations
@@ -24,6 +24,10 @@ WORKER_SECONDS = 30.0
 """A scheduler may wait so long for its first worker."""
 
 
+_WARM: set[tuple[str, str]] = set()
+"""Warm-ups that this process has done, by module and name: a function may come here as several copies."""
+
+
 class TrialError(VpstoError):
     """A run of an experiment failed; the message names it."""
 
@@ -36,10 +40,33 @@ class Outcome:
     error: str | None = None
 
 
-def attempt(trial: Callable[[Any], Any], task: Any) -> Outcome:
-    """Run a trial and turn an exception into words, which travel between processes and machines."""
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """What a worker does with each task.
+
+    Attributes:
+        trial: the function that turns a task into a result.
+        warm_up: called once in every process before its first task, so that compiling and loading do not
+            count in the time a trial measures; None for nothing.
+    """
+
+    trial: Callable[[Any], Any]
+    warm_up: Callable[[], Any] | None = None
+
+    def __call__(self, task: Any) -> Any:
+        """The result of a task."""
+        if self.warm_up is not None:
+            name = self.warm_up.__module__, self.warm_up.__qualname__
+            if name not in _WARM:
+                self.warm_up()
+                _WARM.add(name)
+        return self.trial(task)
+
+
+def attempt(work: Callable[[Any], Any], task: Any) -> Outcome:
+    """Do a task and turn an exception into words, which travel between processes and machines."""
     try:
-        return Outcome(trial(task))
+        return Outcome(work(task))
     except VpstoError as error:
         return Outcome(error=f"{type(error).__name__}: {error}")
     except Exception as error:
@@ -47,15 +74,15 @@ def attempt(trial: Callable[[Any], Any], task: Any) -> Outcome:
 
 
 def in_this_process(
-    trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
+    work: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
 ) -> Generator[tuple[int, Outcome]]:
     """One after the other; each gets a copy of its task, as a worker would."""
     for index, task in tasks:
-        yield index, attempt(trial, pickle.loads(pickle.dumps(task)))
+        yield index, attempt(work, pickle.loads(pickle.dumps(task)))
 
 
 def in_processes(
-    trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]], jobs: int
+    work: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]], jobs: int
 ) -> Generator[tuple[int, Outcome]]:
     """In `jobs` processes of this machine.
 
@@ -65,7 +92,7 @@ def in_processes(
     import joblib
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    calls = (joblib.delayed(_in_worker)(trial, index, task) for index, task in tasks)
+    calls = (joblib.delayed(_in_worker)(work, index, task) for index, task in tasks)
     with joblib.parallel_config("loky", inner_max_num_threads=1):
         # Arrays are sent, not mapped from a shared file: a trial may write into its task.
         parallel = joblib.Parallel(
@@ -80,20 +107,20 @@ def in_processes(
             outcomes.close()
 
 
-def _in_worker(trial: Callable[[Any], Any], index: int, task: Any) -> tuple[int, Outcome]:
+def _in_worker(work: Callable[[Any], Any], index: int, task: Any) -> tuple[int, Outcome]:
     with contextlib.suppress(ValueError):  # not the main thread
         # Ctrl-C reaches the whole process group; the parent decides what to do about it.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return index, attempt(trial, task)
+    return index, attempt(work, task)
 
 
 def on_cluster(
-    trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]], scheduler: str
+    work: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]], scheduler: str
 ) -> Generator[tuple[int, Outcome]]:
     """On the workers of a Dask scheduler; what a dead worker was doing is done again by another.
 
     Args:
-        trial: as of :func:`sim_bridge.experiments.runs.run_trials`.
+        work: what is done with a task.
         tasks: with their indices.
         scheduler: address such as ``tcp://10.0.0.1:8786``.
 
@@ -104,7 +131,7 @@ def on_cluster(
     client = _connect(scheduler)
     try:
         _check_workers(client, scheduler)
-        yield from _collect(client, trial, tasks)
+        yield from _collect(client, work, tasks)
     finally:
         with contextlib.suppress(OSError, TimeoutError):
             client.close()
@@ -149,14 +176,14 @@ def package_version() -> str:
 
 
 def _collect(
-    client: Any, trial: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
+    client: Any, work: Callable[[Any], Any], tasks: Sequence[tuple[int, Any]]
 ) -> Generator[tuple[int, Outcome]]:
     from distributed import as_completed
 
     indices = {}
     for index, task in tasks:
         # Impure: the scheduler must not take an older result of the same call for this one.
-        indices[client.submit(_alone, trial, task, pure=False)] = index
+        indices[client.submit(_alone, work, task, pure=False)] = index
     try:
         for future in as_completed(list(indices), loop=client.loop):
             yield indices[future], _result(future)
@@ -175,7 +202,7 @@ def _result(future: Any) -> Outcome:
 _ONE_AT_A_TIME = threading.Lock()
 
 
-def _alone(trial: Callable[[Any], Any], task: Any) -> Outcome:
+def _alone(work: Callable[[Any], Any], task: Any) -> Outcome:
     """A trial in a worker that may have several threads: trials take turns there, they share a process."""
     with _ONE_AT_A_TIME:
-        return attempt(trial, task)
+        return attempt(work, task)
