@@ -19,7 +19,8 @@ from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.planar import MovingDisc
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel, push_directions
-from vpsto_ros.optimization.costs import JointSpaceProblem, position_extrema
+from vpsto_ros.optimization.costs import JointSpaceProblem
+from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch

@@ -10,9 +10,8 @@ from scipy.interpolate import CubicSpline
 
 from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, InvalidInputError
 from vpsto_ros.optimization import costs
-from vpsto_ros.optimization.costs import (
-    CostWeights,
-    JointSpaceProblem,
+from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
+from vpsto_ros.optimization.terms import (
     collision_cost,
     duration_cost,
     joint_limit_cost,

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.optimization.vpsto import Evaluation, VpstoConfig, search
-from vpsto_ros.priors.smoothness import GaussianPrior
+from vpsto_ros.optimization.progress import Evaluation
+from vpsto_ros.optimization.vpsto import VpstoConfig, search
+from vpsto_ros.priors.gaussian import GaussianPrior
 
 TARGET = np.array([[0.5, -0.3], [1.0, 0.2]])
 
@@ -287,6 +288,26 @@ def test_wrong_arguments_are_named(prior):
         run(GaussianPrior(np.zeros(0), np.zeros((0, 0)), 2))
     with pytest.raises(InvalidInputError, match="sigma"):
         run(prior, sigma=0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"prior": None}, "prior must be a GaussianPrior"),
+        ({"evaluate": None}, "evaluate must be a function"),
+        ({"config": {}}, "config must be a VpstoConfig"),
+        ({"rng": None}, "rng must be a Generator"),
+        ({"rng": 3}, "rng must be a Generator"),
+        ({"deadline": math.nan}, "deadline must be a time"),
+        ({"deadline": "soon"}, "deadline must be a time"),
+    ],
+)
+def test_things_of_another_kind_are_named(prior, change, message):
+    arguments = {
+        "prior": prior, "evaluate": bowl, "config": VpstoConfig(), "rng": np.random.default_rng(0), **change,
+    }  # fmt: skip
+    with pytest.raises(InvalidInputError, match=message):
+        search(**arguments)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from scipy.optimize import minimize
 
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.priors.contact import contact_factor
-from vpsto_ros.priors.smoothness import GaussianPrior, SeparablePrior, smoothness_prior
+from vpsto_ros.priors.gaussian import GaussianPrior, SeparablePrior
+from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.trajectory import OptimalBasis
 
 START, END = np.array([0.2, -1.0]), np.array([1.0, 0.5])

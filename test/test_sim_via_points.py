@@ -140,6 +140,8 @@ def test_via_points_verdict_can_fail():
         "limits_broken": 1,
     }.items():
         assert via_points.verdict({**good, key: value}) == 1
+    for key in good:
+        assert via_points.verdict({**good, key: np.nan}) == 1
 
 
 def test_key_timing_experiment(tmp_path, capsys):

@@ -282,13 +282,20 @@ def test_refuses_ragged_rows_bad_generators_and_bad_times():
             time_key_positions(bad, box(2))
     with pytest.raises(InvalidInputError, match="rng"):
         time_key_positions(keys, box(2), rng=3)
-    with pytest.raises(InvalidInputError, match="start_time"):
-        time_key_positions(keys, box(2), start_time=np.nan)
+    for bad in (np.nan, "x", None):
+        with pytest.raises(InvalidInputError, match="start_time"):
+            time_key_positions(keys, box(2), start_time=bad)
+    with pytest.raises(InvalidInputError, match="limits must be a Limits"):
+        time_key_positions(keys, None)
+    with pytest.raises(InvalidInputError, match="config must be a KeyTimingConfig"):
+        time_key_positions(keys, box(2), config={})
     with pytest.raises(InvalidInputError, match="key positions"):
         time_key_positions(keys, box(3))
 
 
-@pytest.mark.parametrize("velocity", [[0.0], [0.0, np.nan], np.zeros((2, 2)), 0.0, np.zeros(3)])
+@pytest.mark.parametrize(
+    "velocity", [[0.0], [0.0, np.nan], np.zeros((2, 2)), np.zeros((2, 1)), 0.0, np.zeros(3), "ab"]
+)
 def test_refuses_bad_boundary_velocities(velocity):
     keys = [[0.0, 0.0], [0.5, 0.1], [1.0, 1.0]]
     with pytest.raises(InvalidInputError, match="velocity"):

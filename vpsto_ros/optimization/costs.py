@@ -1,7 +1,7 @@
 """The plain problem of VP-STO for any number of joints, and the cost terms it is made of (4.3).
 
-Rows of a batch whose
-duration is infinite (a boundary velocity beyond its limit) have an infinite cost and are invalid.
+Rows of a batch whose duration is infinite (a boundary velocity beyond its limit) have an infinite cost and
+are invalid.
 """
 
 import dataclasses
@@ -10,6 +10,7 @@ import numpy as np
 
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
+from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.terms import (
     CollisionCheck,
     Term,
@@ -17,12 +18,10 @@ from vpsto_ros.optimization.terms import (
     duration_cost,
     in_collision,
     joint_limit_cost,
-    position_extrema,
-    pushing_progress_cost,
     smoothness_cost,
 )
-from vpsto_ros.optimization.vpsto import Evaluation
-from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
+from vpsto_ros.priors.gaussian import GaussianPrior
+from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.trajectory import (
     MINIMUM_DURATION,
     Limits,
@@ -34,18 +33,7 @@ from vpsto_ros.trajectory import (
     synthesize_batch,
 )
 
-__all__ = [
-    "CollisionCheck",
-    "CostWeights",
-    "JointSpaceProblem",
-    "Term",
-    "collision_cost",
-    "duration_cost",
-    "joint_limit_cost",
-    "position_extrema",
-    "pushing_progress_cost",
-    "smoothness_cost",
-]
+__all__ = ["CostWeights", "JointSpaceProblem"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,7 @@ thesis.
 
 import dataclasses
 import math
+import numbers
 import time
 from collections.abc import Callable
 
@@ -97,9 +98,10 @@ def search(
         clock: reads the time in seconds. A clock that counts evaluations makes the deadline a budget of them.
 
     Raises:
-        InvalidInputError: shapes do not fit, or ``evaluate`` returned something else than costs (B,) and
-            validity (B,).
+        InvalidInputError: a type or shape does not fit, the deadline is not a number, or ``evaluate``
+            returned something else than costs (B,) and validity (B,).
     """
+    _check_kinds(prior, evaluate, config, rng, deadline)
     best, timer = Incumbents(), Timer(deadline, clock, config.reserve)
     starts = _latent_starts(prior, config, mean, means)
     if len(starts) > config.starts:
@@ -200,6 +202,27 @@ class _Attempt:
         # The difference of infinite costs is nan, which is not below the tolerance.
         settled = len(recent) > patience and max(recent) - min(recent) < self._config.tolerance
         return settled or self.collapsed
+
+
+def _check_kinds(
+    prior: GaussianPrior,
+    evaluate: Evaluate,
+    config: VpstoConfig,
+    rng: np.random.Generator,
+    deadline: float | None,
+) -> None:
+    expected: dict[str, tuple[object, type]] = {
+        "prior": (prior, GaussianPrior),
+        "config": (config, VpstoConfig),
+        "rng": (rng, np.random.Generator),
+    }
+    for name, (value, kind) in expected.items():
+        if not isinstance(value, kind):
+            raise InvalidInputError(f"{name} must be a {kind.__name__}, got {value!r}")
+    if not callable(evaluate):
+        raise InvalidInputError(f"evaluate must be a function of points (B, P, n), got {evaluate!r}")
+    if deadline is not None and (not isinstance(deadline, numbers.Real) or math.isnan(deadline)):
+        raise InvalidInputError(f"deadline must be a time in seconds or None, got {deadline!r}")
 
 
 def _latent_starts(

@@ -6,14 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.contact.pushing import PushingModel, rollout
-from vpsto_ros.optimization.vpsto import Evaluation
+from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushes import StraightPushes, around
 from vpsto_ros.planning.pushing_config import PushingCosts
 from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.priors.contact import contact_factor
-from vpsto_ros.priors.smoothness import GaussianPrior, smoothness_prior
+from vpsto_ros.priors.gaussian import GaussianPrior
+from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.trajectory import (
     Limits,
     OptimalBasis,

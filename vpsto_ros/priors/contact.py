@@ -23,7 +23,7 @@ def contact_factor(
 
     Returns:
         Precision (D, D) and information vector (precision times mean) (D,) with D = P n, for
-        :meth:`vpsto_ros.priors.smoothness.GaussianPrior.times`.
+        :meth:`vpsto_ros.priors.gaussian.GaussianPrior.times`.
 
     Raises:
         InvalidInputError: index out of range, wrong shape, not finite or not positive definite.

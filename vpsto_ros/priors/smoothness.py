@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.priors.gaussian import GaussianPrior, SeparablePrior, solve
+from vpsto_ros.priors.gaussian import GaussianPrior, SeparablePrior, solve  # noqa: F401
 
 if TYPE_CHECKING:
     from vpsto_ros.trajectory.basis import OptimalBasis
 
-__all__ = ["GaussianPrior", "SeparablePrior", "smoothness_prior"]
+__all__ = ["smoothness_prior"]
 
 
 def smoothness_prior(

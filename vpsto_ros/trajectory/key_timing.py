@@ -87,22 +87,44 @@ def time_key_positions(
         start_time: time of the first key position [s].
 
     Raises:
-        InvalidInputError: if shapes do not fit or an entry is not finite.
+        InvalidInputError: if a type or shape does not fit or an entry is not finite.
         InfeasibleError: if a boundary velocity is beyond its limit.
     """
+    _check_kind("limits", limits, Limits)
+    config = KeyTimingConfig() if config is None else config
+    _check_kind("config", config, KeyTimingConfig)
+    if rng is not None:
+        _check_kind("rng", rng, np.random.Generator)
     keys = _matrix(key_positions, limits.dof)
-    if rng is not None and not isinstance(rng, np.random.Generator):
-        raise InvalidInputError(f"rng must be a numpy.random.Generator, got {rng!r}")
-    start, end = (np.zeros(limits.dof) if v is None else np.ravel(v) for v in (start_velocity, end_velocity))
+    start = _velocity("start_velocity", start_velocity, limits.dof)
+    end = _velocity("end_velocity", end_velocity, limits.dof)
     uniform = OptimalBasis.uniform(len(keys) - 2)
     equal = synthesize(uniform, keys, start, end, limits, start_time=start_time)
-    timing = _Timing(keys, np.array([start, end], dtype=np.float64), limits, config or KeyTimingConfig())
+    timing = _Timing(keys, np.array([start, end]), limits, config)
     if equal.duration > MINIMUM_DURATION and uniform.n_via > 0:
         timing.search(rng)
     if timing.duration >= equal.duration:
         return TimedKeys(uniform.phases, equal.duration, equal.duration, equal)
     best = timing.trajectory(timing.basis, timing.duration, start_time)
     return TimedKeys(timing.basis.phases, best.duration, equal.duration, best)
+
+
+def _check_kind(name: str, value: object, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise InvalidInputError(f"{name} must be a {kind.__name__}, got {value!r}")
+
+
+def _velocity(name: str, value: ArrayLike | None, dof: int) -> NDArray[np.float64]:
+    """A boundary velocity (n,), zero if none is given; one joint may be given a plain number."""
+    expected = f"{name} must be finite numbers of shape ({dof},)"
+    try:
+        velocity = np.zeros(dof) if value is None else np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"{expected}: {error}") from error
+    velocity = velocity.reshape(1) if velocity.ndim == 0 else velocity
+    if velocity.shape != (dof,) or not np.isfinite(velocity).all():
+        raise InvalidInputError(f"{expected}; got {value!r}")
+    return velocity
 
 
 def _matrix(key_positions: ArrayLike, dof: int) -> NDArray[np.float64]:

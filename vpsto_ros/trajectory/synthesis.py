@@ -1,6 +1,7 @@
 """One trajectory through key positions, and the one that brakes from any velocity."""
 
 import dataclasses
+import numbers
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,8 +46,8 @@ def synthesize(
         raise InfeasibleError(_beyond_limit(start_velocity, end_velocity, limits))
     if duration is not None and not (np.isfinite(duration) and duration > 0.0):
         raise InvalidInputError(f"duration must be positive and finite, got {duration}")
-    if not np.isfinite(start_time):
-        raise InvalidInputError(f"start_time must be finite, got {start_time}")
+    if not isinstance(start_time, numbers.Real) or not np.isfinite(start_time):
+        raise InvalidInputError(f"start_time must be a finite number, got {start_time!r}")
     total = shortest if duration is None else float(duration)
     ends = np.array([start_velocity, end_velocity], dtype=np.float64)
     by_keys, by_velocity = basis.knot_slopes[:, :-2], basis.knot_slopes[:, -2:]

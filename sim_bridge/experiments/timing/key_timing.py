@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
+from sim_bridge.warm_up import evaluate_a_trajectory
 from vpsto_ros.trajectory import (
     Limits,
     OptimalBasis,
@@ -88,7 +89,6 @@ def chord_phases(keys: NDArray[np.float64], limits: Limits) -> NDArray[np.float6
 
 def solve(task: Task) -> Outcome:
     """Time one set of key positions in three ways."""
-    _loaded()
     keys, limits = key_positions(task)
     begin = time.thread_time()
     timed = time_key_positions(keys, limits)
@@ -97,12 +97,6 @@ def solve(task: Task) -> Outcome:
     chord = minimal_duration(OptimalBasis(chord_phases(keys, limits)), keys, still, still, limits)
     broken = timed.trajectory.violations(dataclasses.replace(limits, lower=None, upper=None))
     return Outcome(timed.duration, timed.equal_spacing, float(chord), seconds, tuple(broken))
-
-
-@functools.cache
-def _loaded() -> None:
-    """Load SciPy and the kernels, which the first task of a process would otherwise be charged with."""
-    time_key_positions([[0.0], [0.2], [1.0]], Limits(np.ones(1), np.ones(1)))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
     kinds = [(name, n) for name in SETS for n in COUNTS]
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     tasks = [Task(name, n, seed) for name, n in kinds for seed in seeds]
-    found = run_trials(solve, tasks, Execution.from_arguments(arguments), "key_timing")
+    found = run_trials(solve, tasks, Execution.from_arguments(arguments), "key_timing", evaluate_a_trajectory)
     size = len(seeds)
     outcomes = {kind: found[i * size : (i + 1) * size] for i, kind in enumerate(kinds)}
     rows: list[dict] = [{"set": name, "n_via": n, **summarise(outcomes[name, n])} for name, n in kinds]

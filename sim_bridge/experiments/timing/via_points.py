@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
 from sim_bridge.experiments.timing import via_points_figure
 from sim_bridge.experiments.timing.linear_program import optimal_duration
+from sim_bridge.warm_up import plan_in_clutter
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, time_key_positions
@@ -113,7 +114,6 @@ class Task:
 
 def solve(task: Task) -> Outcome:
     """One search from its seed."""
-    _compiled()
     case = task.case
     problem, rng = case.problem, np.random.default_rng(task.seed)
     begin = time.thread_time()
@@ -123,13 +123,6 @@ def solve(task: Task) -> Outcome:
     trajectory = problem.trajectory(result.points)
     broken = tuple(trajectory.violations(case.limits))
     return Outcome(trajectory.duration, result.points, result.iterations, seconds, broken)
-
-
-@functools.cache
-def _compiled() -> None:
-    """Load the kernels, which the first search of a process would otherwise be charged with."""
-    case = cases()[0][0]
-    search(case.problem.prior(), case.problem.evaluate, VpstoConfig(iterations=2), np.random.default_rng(0))
 
 
 def free_timing(n_via: int) -> Trajectory:
@@ -164,7 +157,7 @@ def run(arguments: argparse.Namespace) -> int:
     ones, sevens = cases()
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     tasks = [Task(case, seed) for case in (*ones, *sevens) for seed in seeds]
-    found = run_trials(solve, tasks, Execution.from_arguments(arguments), "via_points")
+    found = run_trials(solve, tasks, Execution.from_arguments(arguments), "via_points", plan_in_clutter)
     outcomes = {
         case.name: found[i * len(seeds) : (i + 1) * len(seeds)] for i, case in enumerate((*ones, *sevens))
     }
@@ -219,7 +212,8 @@ def verdict(summary: dict) -> int:
     """Print the verdict; 0 when the search is within half a percent everywhere, fast and within limits."""
     gaps = [summary[key] for key in ("worst_gap_to_lp", "gap_7dof_n5", "gap_7dof_n10")]
     seconds = summary["seconds_7dof_n5_p50"]
-    good = max(gaps) <= LARGEST_GAP and seconds <= MOST_SECONDS and summary["limits_broken"] == 0
+    near = all(gap <= LARGEST_GAP for gap in gaps)  # max(gaps) could hide a nan
+    good = near and seconds <= MOST_SECONDS and summary["limits_broken"] == 0
     return print_verdict(
         good,
         f"worst gaps to the optimum {100 * gaps[0]:.3f} % (1-D), {100 * gaps[1]:.3f} % and "
