@@ -12,7 +12,8 @@ import pickle
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from multiprocessing import resource_tracker
 from typing import Any
 
 from vpsto_ros import __version__
@@ -98,13 +99,28 @@ def in_processes(
         parallel = joblib.Parallel(
             n_jobs=jobs, batch_size=1, max_nbytes=None, return_as="generator_unordered"
         )
-        outcomes = parallel(calls)
+        with _interrupts_wait():
+            outcomes = parallel(calls)  # starts the workers
         try:
             yield from outcomes
         except BrokenProcessPool as error:
             raise TrialError(f"a worker process died (killed, or out of memory?): {error}") from error
         finally:
             outcomes.close()
+
+
+@contextlib.contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C comes after this block, and never to processes started in it: they inherit what is blocked."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # would be started with the first worker, and then end the block
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _in_worker(work: Callable[[Any], Any], index: int, task: Any) -> tuple[int, Outcome]:
