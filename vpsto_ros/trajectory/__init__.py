@@ -1,5 +1,6 @@
 """Trajectories from optimal basis functions and their minimal duration (ch. 3)."""
 
+import vpsto_ros.kernel_cache  # noqa: F401 (before the first kernel)
 from vpsto_ros.trajectory.basis import OptimalBasis
 from vpsto_ros.trajectory.key_timing import KeyTimingConfig, TimedKeys, time_key_positions
 from vpsto_ros.trajectory.synthesis import braking_trajectory, synthesize
