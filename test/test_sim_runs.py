@@ -1,6 +1,7 @@
 """Many runs: the same results wherever they are computed, and nothing finished is lost."""
 
 import argparse
+import importlib
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from sim_bridge.experiments.runs import Execution, describe, run_trials, store
 from sim_bridge.experiments.runs.store import RunStore, fingerprint
 from sim_bridge.experiments.runs.workers import TrialError
+from vpsto_ros import sources
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -160,7 +162,7 @@ def test_a_failed_run_is_named_and_the_finished_ones_are_taken_over(tmp_path, ca
     assert f"squares: {kept} of 6 runs taken over" in capsys.readouterr().out
 
 
-def test_only_the_same_task_of_the_same_version_is_taken_over(tmp_path, monkeypatch):
+def test_only_the_same_task_is_taken_over(tmp_path):
     first = [(str(tmp_path), seed) for seed in range(3)]
     run_trials(logged, first, Execution(folder=tmp_path), "a")
     ran(tmp_path)
@@ -169,9 +171,50 @@ def test_only_the_same_task_of_the_same_version_is_taken_over(tmp_path, monkeypa
     assert ran(tmp_path) == [7]
     run_trials(logged, [*first, (str(tmp_path), 7)], resume, "a")
     assert ran(tmp_path) == []
-    monkeypatch.setattr(store, "__version__", "99.0")
-    run_trials(logged, first, resume, "a")
-    assert ran(tmp_path) == [0, 1, 2]
+
+
+def trial_of_a_file(folder, text, monkeypatch):
+    """`trial` of a module with this text, as after an edit and a new start of the process."""
+    (folder / "an_experiment.py").write_text(text)
+    monkeypatch.syspath_prepend(str(folder))
+    sys.modules.pop("an_experiment", None)
+    sources._content.cache_clear()
+    importlib.invalidate_caches()
+    sys.dont_write_bytecode, before = True, sys.dont_write_bytecode
+    module = importlib.import_module("an_experiment")
+    sys.dont_write_bytecode = before
+    return module.trial
+
+
+def test_results_of_other_code_are_computed_again_and_it_is_said(tmp_path, monkeypatch, capsys):
+    text = "LIMIT = {}\ndef trial(seed): return seed < LIMIT\n"
+    first = trial_of_a_file(tmp_path, text.format(2), monkeypatch)
+    run_trials(first, range(4), Execution(folder=tmp_path), "a")
+    resume = Execution(folder=tmp_path, resume=True)
+    same = trial_of_a_file(tmp_path, text.format(2), monkeypatch)
+    assert run_trials(same, range(4), resume, "a") == [True, True, False, False]
+    assert "a: 4 of 4 runs taken over" in capsys.readouterr().out
+    changed = trial_of_a_file(tmp_path, text.format(4), monkeypatch)
+    assert run_trials(changed, range(4), resume, "a") == [True] * 4
+    said = capsys.readouterr().out
+    assert "a: the code has changed since the record was made: all runs are computed again" in said
+    assert "taken over" not in said and (tmp_path / "finished_runs" / "a.trial.other_code").exists()
+    assert run_trials(changed, range(4), resume, "a") == [True] * 4
+    assert "a: 4 of 4 runs taken over" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("file", ["sim_bridge/simulation.py", "vpsto_ros/robot/models/fr3_pusher.xml"])
+def test_every_source_and_model_counts_as_code(monkeypatch, file):
+    before, read = store.code_digest(random_sum), sources._content
+    changed = {ROOT / file: read(ROOT / file) + b" "}
+    monkeypatch.setattr(sources, "_content", lambda path: changed.get(path) or read(path))
+    assert store.code_digest(random_sum) != before
+
+
+def test_a_record_of_an_older_format_counts_as_other_code(tmp_path):
+    (tmp_path / "record").write_bytes(b"vpsto runs 1\n" + bytes(40))
+    with RunStore(tmp_path / "record", keep=True) as record:
+        assert record.finished == {} and record.outdated == tmp_path / "record.other_code"
 
 
 def test_without_resume_everything_is_run_again_and_the_old_record_goes(tmp_path):
@@ -330,6 +373,12 @@ def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
     monkeypatch.setattr("sim_bridge.experiments.runs.workers.__version__", "99.0")
     with pytest.raises(ConfigurationError, match=r"has vpsto_ros .*, here it is 99\.0"):
         run_trials(random_sum, range(2), Execution(scheduler=scheduler), "other version")
+
+
+def test_workers_with_other_code_are_refused(scheduler, monkeypatch):
+    monkeypatch.setattr("sim_bridge.experiments.runs.workers.digest", lambda files: "another")
+    with pytest.raises(ConfigurationError, match=r"vpsto_ros .*\(code \w{12}\), here it is .*code another"):
+        run_trials(random_sum, range(2), Execution(scheduler=scheduler), "other code")
 
 
 def test_tasks_are_named_by_their_seed():

@@ -14,7 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from sim_bridge.experiments.runs.store import RunStore, fingerprint
+from sim_bridge.experiments.runs.store import RunStore, code_digest, fingerprint
 from sim_bridge.experiments.runs.workers import (
     Outcome,
     TrialError,
@@ -34,8 +34,8 @@ class Execution:
         jobs: processes on this machine; 1 runs in this one, 0 uses every core.
         scheduler: address of a Dask scheduler that runs them instead, None for this machine.
         folder: where finished runs are kept as they come, None to keep none.
-        resume: take over the finished runs of an earlier, interrupted call from the folder. Otherwise
-            an old record is replaced.
+        resume: take over the finished runs of an earlier, interrupted call from the folder, if the same code
+            computed them; those of other code are computed again. Otherwise an old record is replaced.
     """
 
     jobs: int = 1
@@ -72,7 +72,7 @@ class Execution:
             return None
         name = re.sub(r"[^\w.-]+", "_", f"{label}.{trial.__name__}").strip("_")
         path = self.folder / "finished_runs" / name
-        store = RunStore(path, keep=self.resume or path in self._opened)
+        store = RunStore(path, keep=self.resume or path in self._opened, code=code_digest(trial))
         self._opened.add(path)
         return store
 
@@ -151,6 +151,10 @@ def _taken_over(
 ) -> dict[int, Any]:
     """Results of an earlier call, by index; says how many there are."""
     if store is None or not execution.resume:
+        return {}
+    if store.outdated is not None:
+        notice = "the code has changed since the record was made: all runs are computed again"
+        print(f"{label}: {notice} (the old record is now {store.outdated})", flush=True)
         return {}
     results = {index: store.finished[key] for index, key in enumerate(keys) if key in store.finished}
     print(f"{label}: {len(results)} of {len(keys)} runs taken over from {store.path}", flush=True)

@@ -18,6 +18,7 @@ from typing import Any
 
 from vpsto_ros import __version__
 from vpsto_ros.exceptions import ConfigurationError, VpstoError
+from vpsto_ros.sources import digest, package_files
 
 CONNECT_SECONDS = 5.0
 """A scheduler that has not answered after this time is not there."""
@@ -142,7 +143,7 @@ def on_cluster(
 
     Raises:
         ConfigurationError: when Dask is missing, nothing answers at the address, there are no workers, or
-            they have another version of this package.
+            they have another version or other code of this package.
     """
     client = _connect(scheduler)
     try:
@@ -181,14 +182,15 @@ def _check_workers(client: Any, scheduler: str) -> None:
         versions = client.run(package_version)
     except Exception as error:  # whatever the worker could not import
         raise ConfigurationError(f"the workers of {scheduler} cannot load vpsto_ros: {error}") from error
+    here = package_version()
     for worker, version in versions.items():
-        if version != __version__:
-            raise ConfigurationError(f"worker {worker} has vpsto_ros {version}, here it is {__version__}")
+        if version != here:
+            raise ConfigurationError(f"worker {worker} has vpsto_ros {version}, here it is {here}")
 
 
 def package_version() -> str:
-    """The version of this package, asked of a worker."""
-    return __version__
+    """The version of this package and of its code, asked of a worker."""
+    return f"{__version__} (code {digest(package_files())[:12]})"
 
 
 def _collect(
