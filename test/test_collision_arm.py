@@ -1,5 +1,7 @@
 """The arm against Pinocchio and coal, proofs along motions against dense sampling, bad input."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,11 +11,11 @@ pin = pytest.importorskip("pinocchio")
 from vpsto_ros.collision import arm_kernels as kernels  # noqa: E402
 from vpsto_ros.collision.arm import ArmCollision, Contact  # noqa: E402
 from vpsto_ros.collision.arm_cost import ArmPathCost  # noqa: E402
-from vpsto_ros.collision.arm_model import NEVER, SUFFIX, fr3_capsules, read_capsules  # noqa: E402
+from vpsto_ros.collision.arm_model import MARGIN_LIMIT, SUFFIX, fr3_capsules, read_capsules  # noqa: E402
 from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Sphere, rotation_z  # noqa: E402
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError  # noqa: E402
 from vpsto_ros.robot.kinematics import MODEL_PATH, fr3_pusher  # noqa: E402
-from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize, synthesize_batch  # noqa: E402
+from vpsto_ros.trajectory import OptimalBasis, Trajectory, TrajectoryBatch, synthesize, synthesize_batch  # noqa: E402
 
 CELL = (
     HalfSpace([0, 0, 1], 0.0, "table"),
@@ -91,7 +93,7 @@ def test_distances_and_collisions_agree_with_pinocchio_and_coal(oracle):
 
 
 def test_pairs_left_out_never_touch(oracle):
-    """No pair of different links that the rules drop as never touching comes close, on other postures."""
+    """No pair of distant links that the rules drop comes closer than any margin, on other postures."""
     checker = ArmCollision()
     arrays = checker.model.arrays
     everything = np.array(
@@ -102,7 +104,7 @@ def test_pairs_left_out_never_touch(oracle):
     from vpsto_ros.collision.arm_distance_kernels import self_distance_range
 
     nearest, _ = self_distance_range(arrays._replace(pairs=dropped), postures(77, 50_000))
-    assert len(dropped) and nearest.min() > 0.5 * NEVER
+    assert len(dropped) and nearest.min() > MARGIN_LIMIT
 
 
 def test_pruned_pairs_are_those_out_of_reach():
@@ -151,11 +153,12 @@ def encloses(capsule, points):
 
 
 def test_sines_and_placed_capsules():
-    angles = np.concatenate([np.random.default_rng(0).uniform(-100, 100, 5000), np.arange(-8, 9) * np.pi / 4])
-    sine, cosine = np.empty_like(angles), np.empty_like(angles)
-    kernels.sines(angles, sine, cosine)
-    np.testing.assert_allclose(sine, np.sin(angles), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(cosine, np.cos(angles), rtol=0, atol=1e-14)
+    near = np.concatenate([np.random.default_rng(0).uniform(-100, 100, 5000), np.arange(-8, 9) * np.pi / 4])
+    for angles in (near, np.append(near, [1e9, -1e15, 101.0])):
+        sine, cosine = np.empty_like(angles), np.empty_like(angles)
+        kernels.sines(angles, sine, cosine)
+        np.testing.assert_allclose(sine, np.sin(angles), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(cosine, np.cos(angles), rtol=0, atol=1e-14)
     rod = next(c for c in ArmCollision().capsules(HOME) if c.name == "tool_rod")
     tip, rotation = fr3_pusher().forward(HOME)
     axis = rotation[:, 2]
@@ -236,9 +239,9 @@ def test_cost_is_zero_exactly_for_proven_motions_and_grows_with_depth():
     cost, valid = ArmPathCost(checker, weight=1.0)(batch)
     plain, _ = ArmPathCost(checker, weight=1.0, depth_scale=1e12)(batch)
     hits = checker.in_collision(batch.position).sum(axis=1)
-    np.testing.assert_allclose(plain[hits > 0], hits[hits > 0] / 40, rtol=1e-9)
+    np.testing.assert_allclose(plain[hits > 0], (hits / 40 * batch.duration)[hits > 0], rtol=1e-9)
     assert (cost[hits > 0] > plain[hits > 0]).all()
-    np.testing.assert_allclose(cost[(hits == 0) & ~valid], 0.5 / 40)
+    np.testing.assert_allclose(cost[(hits == 0) & ~valid], (0.5 / 40 * batch.duration)[(hits == 0) & ~valid])
     assert 0.1 < valid.mean() < 0.9
     bare = checker.with_margin(0.0)
     for b in range(len(keys)):
@@ -254,7 +257,56 @@ def test_cost_is_deeper_in_the_middle_of_an_obstacle():
         ArmCollision(None, [Box(tip - [0, 0, below], [0.2, 0.2, 0.1], name="block")]) for below in (0.1, 0.05)
     ]
     grazing, central = (ArmPathCost(checker, weight=1.0)(batch)[0][0] for checker in checkers)
-    assert central > grazing > 1.0  # every sample counts, and the deeper one more
+    assert central > grazing > batch.duration[0]  # every sample counts, and the deeper one more
+
+
+def as_batch(motion, samples):
+    """A motion of cubic pieces as a batch of one, whatever its knots."""
+    times, duration = np.linspace(0.0, motion.duration, samples), motion.duration
+    derivatives = [motion(times, order)[None] for order in (0, 1, 2)]
+    slopes = duration * motion(motion.times, 1)[None]
+    return TrajectoryBatch(
+        np.array([duration]), *derivatives, motion(motion.times)[None], motion.times / duration, slopes
+    )
+
+
+def test_cost_is_the_time_in_collision_and_a_detour_elsewhere_does_not_lower_it():
+    first = np.eye(7)[0]
+    ball = Sphere(fr3_pusher().forward(HOME)[0], 0.08, "ball")
+    term = ArmPathCost(ArmCollision(None, [ball]), weight=1.0, depth_scale=1e12)
+    limits, basis = fr3_pusher().limits, OptimalBasis.uniform(0)
+    through = synthesize(basis, np.stack([HOME - 0.5 * first, HOME + 0.5 * first]), STILL, STILL, limits)
+    far = np.stack([HOME + 0.5 * first, HOME + 2.2 * first])
+    there, back = (synthesize(basis, keys, STILL, STILL, limits) for keys in (far, far[::-1]))
+    seconds = term.checker.in_collision(through(np.linspace(0.0, through.duration, 20_001))).mean()
+    seconds *= through.duration
+    assert seconds > 0.1
+    motion = through
+    for following in (there, back, there, back):
+        (cost,), (valid,) = term(as_batch(motion, 4001))
+        assert not valid and cost == pytest.approx(seconds, rel=0.02)
+        motion = motion.followed_by(following.shifted(motion.end_time))
+    # Two motions of the search to the same goal: what a detour changes is the time in the ball alone.
+    for samples in (40, 400):
+        ways = np.stack([[HOME + a * first for a in (-0.5, middle, 0.5)] for middle in (0.0, 2.2)])
+        batch = synthesize_batch(OptimalBasis.uniform(1), ways, STILL, STILL, limits, samples)
+        cost, _ = term(batch)
+        for way, found in zip(ways, cost, strict=True):
+            motion = synthesize(OptimalBasis.uniform(1), way, STILL, STILL, limits)
+            hit = term.checker.in_collision(motion(np.linspace(0.0, motion.duration, 20_001)))
+            assert found == pytest.approx(hit.mean() * motion.duration, abs=2.0 * motion.duration / samples)
+
+
+def test_motion_without_a_finite_duration_costs_infinitely_much():
+    batch = as_batch(synthesize(OptimalBasis.uniform(0), np.stack([HOME, HOME + 0.1]), STILL, STILL,
+                                fr3_pusher().limits), 40)  # fmt: skip
+    term = ArmPathCost(ArmCollision())
+    assert term(batch)[1].all()
+    broken = batch.position.copy()
+    broken[0, 7, 3] = np.nan
+    for changed in ({"duration": np.array([np.inf])}, {"position": broken}):
+        cost, valid = term(dataclasses.replace(batch, **changed))
+        assert cost[0] == np.inf and not valid[0]
 
 
 def test_cost_explains_in_words():
@@ -287,7 +339,7 @@ def test_empty_cell_shapes_and_attached():
     held = Sphere([0.0, 0.0, 0.1], 0.04, "held")
     obstacle = Sphere(tip + rotation @ [0.0, 0.0, 0.2], 0.05, "stop")
     with_held = ArmCollision(None, [obstacle], attached=[held])
-    assert with_held.nearest(HOME).link == "held"
+    assert with_held.contacts(HOME, margin=np.inf)[0].link == "held"
     assert with_held.distance(HOME) == pytest.approx(0.01, abs=1e-12)
     assert ArmCollision(None, [obstacle]).distance(HOME) > 0.05
 
@@ -297,6 +349,20 @@ def test_empty_cell_shapes_and_attached():
     [
         (lambda c: c.in_collision(np.zeros((2, 6))), r"shape \(\.\.\., 7\)"),
         (lambda c: c.distance(np.full(7, np.nan)), "finite"),
+        (lambda c: c.in_collision(["a"] * 7), "real numbers"),
+        (lambda c: c.in_collision(np.zeros(7) + 1j), "real numbers"),
+        (lambda c: c.in_collision(None), "joint positions"),
+        (lambda c: c.contacts(HOME, margin=np.nan), "margin must be a number"),
+        (lambda c: c.contacts(HOME, margin="a"), "margin must be a number"),
+        (lambda c: c.explain(Trajectory([0, 1], np.zeros((1, 6, 7))), samples=0), "samples must be"),
+        (lambda c: c.explain(Trajectory([0, 1], np.zeros((1, 6, 3)))), "7 joints, got 3"),
+        (lambda c: c.with_margin("a"), "margin must be a number"),
+        (lambda c: c.with_margin(MARGIN_LIMIT), "less than 0.05 m"),
+        (lambda c: c.free_along(Trajectory([0, 1], np.zeros((1, 6, 7))), margin=0.06), "less than 0.05 m"),
+        (lambda c: c.free_along("a motion"), "expected a Trajectory"),
+        (lambda c: c.with_obstacles(3), "obstacles must be a sequence"),
+        (lambda c: ArmCollision(attached=3), "attached must be a sequence"),
+        (lambda c: ArmCollision("fr3"), "expected an ArmModel"),
         (lambda c: c.contacts(np.zeros((2, 7))), "one posture"),
         (lambda c: c.with_margin(-0.1), "margin must be"),
         (lambda c: c.with_margin(np.nan), "margin must be"),
@@ -308,7 +374,11 @@ def test_empty_cell_shapes_and_attached():
         (lambda c: c.free_along(Trajectory([0, 1], np.zeros((1, 6, 3)))), "7 joints, got 3"),
         (lambda c: c.free_along(Trajectory([0, 1], np.zeros((1, 6, 7))), tolerance=0.0), "tolerance"),
         (lambda c: ArmPathCost(c, proof_margin=0.1), "proof_margin"),
+        (lambda c: ArmPathCost(c, proof_margin=np.nan), "proof_margin"),
         (lambda c: ArmPathCost(c, weight=0.0), "positive"),
+        (lambda c: ArmPathCost(c, weight=np.inf), "positive"),
+        (lambda c: ArmPathCost(c, tolerance="fine"), "tolerance must be a number"),
+        (lambda c: ArmPathCost("arm"), "expected an ArmCollision"),
     ],
 )
 def test_bad_input_is_refused(call, message):

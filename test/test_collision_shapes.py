@@ -6,7 +6,7 @@ import pytest
 coal = pytest.importorskip("coal")
 
 from vpsto_ros.collision import distance as d  # noqa: E402
-from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Sphere, moved, rotation_z  # noqa: E402
+from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Sphere, rotation_z  # noqa: E402
 from vpsto_ros.exceptions import InvalidInputError  # noqa: E402
 
 
@@ -107,15 +107,11 @@ def test_half_space_counts_the_lower_end():
     assert d.capsule_plane_distance(segment, 0.05, plane) == pytest.approx(0.15)
 
 
-def test_shapes_are_normalised_frozen_and_movable():
+def test_shapes_are_normalised_and_frozen():
     plane = HalfSpace([0.0, 0.0, 2.0], 0.5)
     np.testing.assert_allclose(plane.normal, [0.0, 0.0, 1.0])
     assert plane.offset == 0.25
-    assert moved(plane, [1.0, 1.0, 0.5]).offset == 0.75
     box = Box([1.0, 0.0, 0.0], [0.1, 0.1, 0.1], rotation_z(0.3))
-    np.testing.assert_allclose(moved(box, [0.0, 1.0, 0.0]).centre, [1.0, 1.0, 0.0])
-    rod = moved(Capsule([0.0, 0, 0], [0, 0, 1.0], 0.1), [0, 2.0, 0])
-    np.testing.assert_allclose([rod.a, rod.b], [[0, 2, 0], [0, 2, 1]])
     with pytest.raises(ValueError, match="read-only"):
         box.centre[0] = 3.0
 
@@ -135,7 +131,12 @@ def test_shapes_are_normalised_frozen_and_movable():
         (lambda: Capsule([0, 0, 0], [[0, 0, 1]], 0.1), "b must be finite"),
         (lambda: HalfSpace([0, 0, 0], 0.0, "wall"), "wall: normal must not be zero"),
         (lambda: HalfSpace([0, 0, 1], "low"), "offset must be a finite number"),
-        (lambda: moved(Sphere([0, 0, 0], 1.0), [0, 0]), "offset must be finite"),
+        (lambda: Box([0, 0, 1j], [1, 1, 1]), "centre must be finite"),
+        (lambda: Box(np.array([0, 0, 1j]), [1, 1, 1]), "centre must be finite"),
+        (lambda: Sphere([0, 0, 0], 1j), "radius must be a finite number"),
+        (lambda: rotation_z(np.nan), "angle must be a number"),
+        (lambda: rotation_z(np.inf), "angle must be finite"),
+        (lambda: rotation_z("north"), "angle must be a number"),
     ],
 )
 def test_malformed_shapes_are_refused(make, message):

@@ -1,7 +1,7 @@
 """Collision checking of the arm: its links and tool as capsules, against a cell of obstacles and each other.
 
-``in_collision`` says yes or no, more than a million times a second; ``distance``, ``nearest`` and
-``contacts`` say how far, which link and which obstacle; ``free_along`` proves a whole motion free, between
+``in_collision`` says yes or no, more than a million times a second; ``distance`` says how far, ``contacts``
+which link and which obstacle; ``free_along`` proves a whole motion free, between
 samples too; :class:`ArmPathCost` is the term that the search ranks candidates by.
 """
 
@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.collision import arm_distance_kernels as distances
 from vpsto_ros.collision import arm_kernels as kernels
 from vpsto_ros.collision import arm_path_kernels as paths
-from vpsto_ros.collision.arm_model import ArmModel, fr3_capsules
+from vpsto_ros.collision.arm_model import MARGIN_LIMIT, ArmModel, fr3_capsules
 from vpsto_ros.collision.cell import cell_arrays
-from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere
+from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere, number
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory import Trajectory
 
@@ -69,11 +69,12 @@ class ArmCollision:
         robot_model: the arm; the FR3 with its pushing rod by default.
         obstacles: any number of named shapes in the frame of the base; without any, only the arm itself is
             checked. The base stands where it is mounted and is not checked against them.
-        margin: bodies closer than this count as in collision, links of the arm among themselves too [m].
+        margin: bodies closer than this count as in collision, links of the arm among themselves too [m]; less
+            than 5 cm, because pairs of links that never come that close are left out.
         attached: capsules and spheres fixed to the tool, see :meth:`ArmModel.with_attached`.
 
     Raises:
-        InvalidInputError: an obstacle is no shape, two have the same name, or the margin is negative.
+        InvalidInputError: an obstacle is no shape, two have the same name, or the margin is out of range.
     """
 
     def __init__(
@@ -85,9 +86,11 @@ class ArmCollision:
         attached: Sequence[Capsule | Sphere] = (),
     ) -> None:
         model = fr3_capsules() if robot_model is None else robot_model
-        self.model = model.with_attached(tuple(attached))
+        if not isinstance(model, ArmModel):
+            raise InvalidInputError(f"expected an ArmModel, got {robot_model!r}")
+        self.model = model.with_attached(_sequence("attached", attached))
         self.obstacles = _checked_obstacles(obstacles, self.model.names)
-        self.margin = _nonnegative("margin", margin)
+        self.margin = _checked_margin(margin)
         self._arm = self.model.arrays
         self.cell = cell_arrays(self._arm, self.obstacles, self.margin)
         self._whole_cell = cell_arrays(self._arm, self.obstacles, math.inf)
@@ -130,21 +133,20 @@ class ArmCollision:
             InvalidInputError: as :meth:`in_collision`.
         """
         rows, shape = _postures(q)
-        return self._nearest(rows)[0].reshape(shape)
-
-    def nearest(self, q: ArrayLike) -> Contact | None:
-        """The closest pair at one posture (7,) [rad]; None if there is nothing to meet."""
-        rows = _one_posture(q)
-        distance, pair = self._nearest(rows)
-        return None if pair[0] < 0 else Contact(*self.pair_names[int(pair[0])], float(distance[0]))
+        found = np.empty(len(rows))
+        distances.nearest(self._arm, self._whole_cell, rows, found)
+        return found.reshape(shape)
 
     def contacts(self, q: ArrayLike, *, margin: float | None = None) -> list[Contact]:
         """All pairs closer than a margin [m] (that of the checker by default) at q (7,) [rad], deepest first.
 
+        The margin may be anything here; infinite, for all pairs. Parts of the arm that never come within 5 cm
+        of each other are no pair.
+
         Raises:
-            InvalidInputError: as :meth:`in_collision`.
+            InvalidInputError: as :meth:`in_collision`, or the margin is no number.
         """
-        rows, limit = _one_posture(q), self.margin if margin is None else margin
+        rows, limit = _one_posture(q), self.margin if margin is None else number("margin", margin)
         found = np.empty((1, len(self.pair_names)))
         distances.every_pair(self._arm, self._whole_cell, rows, found)
         order = [int(i) for i in np.argsort(found[0], kind="stable") if found[0, i] < limit]
@@ -177,17 +179,16 @@ class ArmCollision:
 
         Args:
             trajectory: of the 7 joints.
-            margin: distance to keep [m]; that of the checker by default.
+            margin: distance to keep [m], less than 5 cm; that of the checker by default.
             tolerance: motion of the links at which halving stops [m].
 
         Raises:
             InvalidInputError: the trajectory has another number of joints, or a number is out of range.
         """
-        if trajectory.dof != 7:
-            raise InvalidInputError(f"expected a trajectory of 7 joints, got {trajectory.dof}")
-        keep = self.margin if margin is None else _nonnegative("margin", margin)
-        if not (math.isfinite(tolerance) and tolerance >= 1e-6):
-            raise InvalidInputError(f"tolerance must be at least 1e-6 m, got {tolerance!r}")
+        _require_seven(trajectory)
+        keep = self.margin if margin is None else _checked_margin(margin)
+        if not 1e-6 <= number("tolerance", tolerance) < math.inf:
+            raise InvalidInputError(f"tolerance must be finite and at least 1e-6 m, got {tolerance!r}")
         piece, begin, end = paths.first_contact(
             self._arm, self._whole_cell, trajectory.coefficients, np.diff(trajectory.times), keep, tolerance
         )
@@ -198,7 +199,18 @@ class ArmCollision:
         return PathCheck(False, time, tuple(close))
 
     def explain(self, trajectory: Trajectory, *, samples: int = 500) -> list[str]:
-        """What a motion collides with, in words: the deepest overlap of every pair and when it happens."""
+        """What a motion collides with, in words: the deepest overlap of every pair and when it happens.
+
+        Args:
+            trajectory: of the 7 joints.
+            samples: postures that are looked at, at even times; at least 2.
+
+        Raises:
+            InvalidInputError: the trajectory has another number of joints, or there are too few samples.
+        """
+        _require_seven(trajectory)
+        if isinstance(samples, bool) or not isinstance(samples, int) or samples < 2:
+            raise InvalidInputError(f"samples must be an integer from 2 on, got {samples!r}")
         times = np.linspace(trajectory.start_time, trajectory.end_time, samples)
         found = np.empty((samples, len(self.pair_names)))
         distances.every_pair(self._arm, self._whole_cell, _postures(trajectory(times))[0], found)
@@ -219,11 +231,6 @@ class ArmCollision:
             for w, radius, name in zip(world, self._arm.radius, self.model.names, strict=True)
         )
 
-    def _nearest(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        distance, pair = np.empty(len(rows)), np.empty(len(rows), dtype=np.int64)
-        distances.nearest(self._arm, self._whole_cell, rows, distance, pair)
-        return distance, pair
-
 
 def _named_pairs(checker: ArmCollision) -> list[tuple[str, str]]:
     """Names of all pairs in the order of the kernels."""
@@ -238,24 +245,47 @@ def _named_pairs(checker: ArmCollision) -> list[tuple[str, str]]:
 
 def _checked_obstacles(obstacles: Sequence[Shape], parts: tuple[str, ...]) -> tuple[Shape, ...]:
     names: set[str] = set(parts)
-    for shape in obstacles:
+    shapes = _sequence("obstacles", obstacles)
+    for shape in shapes:
         if not isinstance(shape, Shape):
             raise InvalidInputError(f"expected a Box, Sphere, Capsule or HalfSpace, got {shape!r}")
         if shape.name in names:
             raise InvalidInputError(f"there are two bodies called '{shape.name}'; give each its own name")
         names.add(shape.name)
-    return tuple(obstacles)
+    return shapes
 
 
-def _nonnegative(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise InvalidInputError(f"{name} must be finite and not negative, got {value!r}")
-    return float(value)
+def _sequence(name: str, shapes: Sequence) -> tuple:
+    try:
+        return tuple(shapes)
+    except TypeError as error:
+        raise InvalidInputError(f"{name} must be a sequence of shapes, got {shapes!r}") from error
+
+
+def _checked_margin(margin: float) -> float:
+    if not 0.0 <= number("margin", margin) < MARGIN_LIMIT:
+        raise InvalidInputError(
+            f"margin must be from 0 to less than {MARGIN_LIMIT} m, got {margin!r}: pairs of links that never "
+            "come that close are left out; to keep more distance from obstacles, make these bigger"
+        )
+    return float(margin)
+
+
+def _require_seven(trajectory: Trajectory) -> None:
+    if not isinstance(trajectory, Trajectory):
+        raise InvalidInputError(f"expected a Trajectory, got {trajectory!r}")
+    if trajectory.dof != 7:
+        raise InvalidInputError(f"expected a trajectory of 7 joints, got {trajectory.dof}")
 
 
 def _postures(q: ArrayLike) -> tuple[NDArray[np.float64], tuple[int, ...]]:
     """Rows (M, 7) and the shape in front."""
-    array = np.ascontiguousarray(q, dtype=float)
+    try:
+        array = None if np.iscomplexobj(q) else np.ascontiguousarray(q, dtype=float)
+    except (TypeError, ValueError):
+        array = None
+    if array is None:
+        raise InvalidInputError(f"joint positions must be real numbers of shape (..., 7), got {q!r}")
     if not array.ndim or array.shape[-1] != 7:
         raise InvalidInputError(f"joint positions must have shape (..., 7), got {array.shape}")
     rows = array.reshape(-1, 7)

@@ -1,10 +1,13 @@
 """The arm's collision as a term of the search."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.collision import arm_path_kernels as paths
 from vpsto_ros.collision.arm import TOLERANCE, ArmCollision
+from vpsto_ros.collision.shapes import number
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory import Trajectory, TrajectoryBatch
 
@@ -12,17 +15,23 @@ from vpsto_ros.trajectory import Trajectory, TrajectoryBatch
 class ArmPathCost:
     """Cost of a batch of motions of the arm; valid are those that are proven free at every instant.
 
-    The cost is the share of the samples in collision, each weighted by one plus its depth, so that a
-    candidate that only grazes is better than one that passes through the middle of an obstacle: a plain count
-    cannot tell these apart and gives the search no direction. A motion without such a sample is proven free
-    between the samples too; where that fails it costs half a sample and is invalid.
+    The cost is the time in collision, as in the plane, weighted by one plus the depth, so that a candidate
+    that only grazes is better than one that passes through the middle of an obstacle: time alone cannot tell
+    these apart and gives the search no direction. The samples measure it, each for an equal part of the
+    duration, so that time spent elsewhere changes nothing. A motion without a sample in collision is proven
+    free between the samples too; where that fails it costs half a sample and is invalid. A motion without a
+    finite duration costs infinitely much.
 
     Args:
         checker: the arm in its cell; a sample closer than its margin counts.
-        weight: factor on the cost.
+        weight: cost of a second in collision.
         proof_margin: distance [m] that is proven of valid motions; smaller than the margin of the checker, so
             that motions that keep the margin at their samples rarely fail between them.
         depth_scale: overlap [m] that counts as much as being in collision at all.
+        tolerance: of the proof [m], see :meth:`ArmCollision.free_along`.
+
+    Raises:
+        InvalidInputError: a number is out of range.
     """
 
     def __init__(
@@ -34,13 +43,16 @@ class ArmPathCost:
         depth_scale: float = 0.05,
         tolerance: float = TOLERANCE,
     ) -> None:
-        if not 0.0 <= proof_margin <= checker.margin:
+        if not isinstance(checker, ArmCollision):
+            raise InvalidInputError(f"expected an ArmCollision, got {checker!r}")
+        if not 0.0 <= number("proof_margin", proof_margin) <= checker.margin:
             raise InvalidInputError(
                 f"proof_margin must be from 0 to the margin of the checker, {checker.margin}, "
                 f"got {proof_margin!r}"
             )
-        if not (weight > 0.0 and depth_scale > 0.0 and tolerance > 0.0):
-            raise InvalidInputError("weight, depth_scale and tolerance must be positive")
+        options = {"weight": weight, "depth_scale": depth_scale, "tolerance": tolerance}
+        if not all(0.0 < number(name, value) < math.inf for name, value in options.items()):
+            raise InvalidInputError(f"these must be finite and positive: {options}")
         self.checker = checker
         self.weight = weight
         self.proof_margin = proof_margin
@@ -56,6 +68,7 @@ class ArmPathCost:
             self.checker.model.arrays,
             self.checker.cell,
             batch.position,
+            batch.duration,
             batch.knots,
             batch.key_positions,
             batch.knot_slopes,

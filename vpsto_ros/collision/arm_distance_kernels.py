@@ -71,16 +71,15 @@ def pair_distances(arm, cell, world, cutoff, falling, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def nearest(arm, cell, q, distance, pair):
-    """Fill the least signed distance (M,) over all pairs and its pair (M,), -1 if there is none."""
+def nearest(arm, cell, q, distance):
+    """Fill the least signed distance (M,) over all pairs, infinite if there is none."""
     sine, cosine, world = workspace(arm)
     out = np.empty(pair_count(arm, cell))
     for m in range(q.shape[0]):
         sines(q[m], sine[0], cosine[0])
         place(arm, sine[0], cosine[0], world)
         pair_distances(arm, cell, world, np.inf, True, out)
-        pair[m] = out.argmin() if out.size else -1
-        distance[m] = out[pair[m]] if out.size else np.inf
+        distance[m] = out.min() if out.size else np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

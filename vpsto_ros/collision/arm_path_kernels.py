@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from vpsto_ros.collision.arm_distance_kernels import overlap, pair_count
-from vpsto_ros.collision.arm_kernels import place, sines, touches, workspace
+from vpsto_ros.collision.arm_kernels import all_finite, place, sines, touches, workspace
 
 _DEPTH = 40  # halvings; the tolerance ends them long before
 
@@ -123,13 +123,16 @@ def _hermite(knots, keys, slopes, coefficients, spans):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, tolerance, depth_scale, cost):
-    """Fill the collision cost (B,) of a batch; zero exactly where a motion is proven free.
+def batch_cost(
+    arm, cell, samples, duration, knots, keys, slopes, margin, proof_margin, tolerance, depth_scale, cost
+):
+    """Fill the collision cost (B,) [s] of a batch; zero exactly where a motion is proven free.
 
     Args:
         arm: the arm.
         cell: its surroundings; pairs that it leaves out must never be closer than the margins.
-        samples: positions (B, K, 7).
+        samples: positions (B, K, 7) at even phases.
+        duration: shape (B,) [s].
         knots: phases between the cubics, shape (N + 2,).
         keys: positions there, shape (B, N + 2, 7).
         slopes: derivatives there with respect to phase, shape (B, N + 2, 7).
@@ -137,7 +140,8 @@ def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, to
         proof_margin: what is proven of the motions without such a sample [m].
         tolerance: of the proof [m].
         depth_scale: overlap that counts as much as the sample itself [m].
-        cost: filled with the share of the samples in collision, each weighted by 1 + overlap / depth_scale.
+        cost: filled with the time in collision, weighted by 1 + overlap / depth_scale; every sample stands
+            for the K-th part of the duration. Infinite where the duration or a position is not finite.
     """
     count = samples.shape[1]
     pieces = knots.shape[0] - 1
@@ -148,6 +152,9 @@ def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, to
     _grow(arm, np.zeros(7), margin, reach, pair_reach)
     for b in range(samples.shape[0]):
         cost[b] = 0.0
+        if not (np.isfinite(duration[b]) and all_finite(samples[b])):
+            cost[b] = np.inf
+            continue
         for m in range(count):
             sines(samples[b, m], sine[0], cosine[0])
             place(arm, sine[0], cosine[0], world)
@@ -157,4 +164,4 @@ def batch_cost(arm, cell, samples, knots, keys, slopes, margin, proof_margin, to
             _hermite(knots, keys[b], slopes[b], coefficients, spans)
             if first_contact(arm, cell, coefficients, spans, proof_margin, tolerance)[0] >= 0:
                 cost[b] = 0.5
-        cost[b] /= count
+        cost[b] *= duration[b] / count

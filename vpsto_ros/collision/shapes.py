@@ -4,11 +4,12 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from vpsto_ros.exceptions import InvalidInputError
 
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_REAL = int | float | np.integer | np.floating
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,21 +115,28 @@ Shape = Box | Sphere | Capsule | HalfSpace
 
 
 def rotation_z(angle: float) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) about the vertical by an angle [rad]."""
+    """Rotation matrix (3, 3) about the vertical by an angle [rad].
+
+    Raises:
+        InvalidInputError: the angle is no finite number.
+    """
+    if not math.isfinite(number("angle", angle)):
+        raise InvalidInputError(f"angle must be finite, got {angle!r}")
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def moved(shape: Shape, offset: ArrayLike) -> Shape:
-    """The same shape, shifted by an offset (3,) [m]."""
-    step = np.array(offset, dtype=float)
-    if step.shape != (3,) or not np.isfinite(step).all():
-        raise InvalidInputError(f"offset must be finite with shape (3,), got {offset!r}")
-    if isinstance(shape, Capsule):
-        return dataclasses.replace(shape, a=shape.a + step, b=shape.b + step)
-    if isinstance(shape, HalfSpace):
-        return dataclasses.replace(shape, offset=shape.offset + float(shape.normal @ step))
-    return dataclasses.replace(shape, centre=shape.centre + step)
+def number(name: str, value: object) -> float:
+    """A real number, possibly infinite.
+
+    Raises:
+        InvalidInputError: it is something else, or nan.
+    """
+    if isinstance(value, bool) or not isinstance(value, _REAL):
+        raise InvalidInputError(f"{name} must be a number, got {value!r}")
+    if math.isnan(value):
+        raise InvalidInputError(f"{name} must be a number, got nan")
+    return float(value)
 
 
 def _set(shape: Shape, **values) -> None:
@@ -144,7 +152,7 @@ def _frozen(array: NDArray[np.float64]) -> NDArray[np.float64]:
 def _array(shape: Shape, field: str, expected: tuple[int, ...]) -> NDArray[np.float64]:
     value = getattr(shape, field)
     try:
-        array = np.array(value, dtype=float)
+        array = np.empty(0) if np.iscomplexobj(value) else np.array(value, dtype=float)
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != expected or not np.isfinite(array).all():
@@ -153,7 +161,7 @@ def _array(shape: Shape, field: str, expected: tuple[int, ...]) -> NDArray[np.fl
 
 
 def _number(shape: Shape, field: str, value: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, _REAL) or not math.isfinite(value):
         raise InvalidInputError(f"{shape.name}: {field} must be a finite number, got {value!r}")
     return float(value)
 

@@ -43,6 +43,9 @@ class ReachConfig:
         0.7, "their standard deviation about it, in the unit of the joints", minimum=0.0
     )
     rounds: int = option(100, "rounds at most", minimum=1, maximum=100_000)
+    evaluations: int = option(
+        0, "candidates evaluated at most in all rounds; 0: as many as the rounds need", minimum=0
+    )
     valid_rounds: int = option(2, "rounds with a valid motion after which the best one will do", minimum=1)
     spread: float = option(
         0.6, "standard deviation of the via-points, in the unit of the joints", minimum=1e-9
@@ -88,11 +91,13 @@ def plan_reach(
         in_collision: maps postures (M, n) to bool (M,).
         config: options.
         rng: source of randomness.
-        deadline: time of ``clock`` by which to be back.
+        deadline: time of ``clock`` by which to be back. What is found then depends on the machine;
+            ``config.evaluations`` limits the effort in a way that does not.
         clock: reads the time in seconds.
 
     Raises:
-        InvalidInputError: the goal is free, or the problem has no position limits to draw postures in.
+        InvalidInputError: the goal is free, the problem has no position limits to draw postures in, or the
+            evaluations allowed are too few for one round of a single iteration.
     """
     if problem.goal is None or problem.limits.lower is None or problem.limits.upper is None:
         raise InvalidInputError("reaching needs a goal, and position limits to draw postures in")
@@ -103,9 +108,12 @@ def plan_reach(
     while rounds < config.rounds and valid_rounds < config.valid_rounds:
         if best is not None and deadline is not None and clock() >= deadline:
             break
+        options = _within_budget(config, evaluations)
+        if options is None:
+            break
         means = np.concatenate([prior.mean_points[None], guesses(problem, in_collision, config, rng)])
         found = search(
-            prior, problem.evaluate, config.search, rng, means=means, deadline=deadline, clock=clock
+            prior, problem.evaluate, options, rng, means=means, deadline=deadline, clock=clock
         )
         rounds, evaluations = rounds + 1, evaluations + found.evaluations
         valid_rounds += found.valid
@@ -113,8 +121,21 @@ def plan_reach(
             first_valid = clock()
         if best is None or _rank(found) < _rank(best):
             best = found
-    assert best is not None
+    if best is None:
+        raise InvalidInputError(f"{config.evaluations} evaluations are too few for a round")
     return ReachResult(best, rounds, evaluations, first_valid)
+
+
+def _within_budget(config: ReachConfig, evaluations: int) -> VpstoConfig | None:
+    """Options of the next round, None if too few evaluations are left for another one."""
+    if not config.evaluations:
+        return config.search
+    largest = round(config.search.population * config.search.population_growth**config.search.restarts)
+    left = config.evaluations - evaluations - config.guesses - 1
+    iterations = left // (largest * config.search.starts)
+    if iterations < 1:
+        return None
+    return dataclasses.replace(config.search, iterations=min(iterations, config.search.iterations))
 
 
 def guesses(
