@@ -11,17 +11,19 @@ import time
 import numpy as np
 
 from sim_bridge.bench.library_rows import cell
-from sim_bridge.experiments.clutter import mpc_runs
+from sim_bridge.experiments.clutter.mpc_runs import Task, run_task
+from sim_bridge.experiments.clutter.mppi import MppiConfig
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from sim_bridge.experiments.pushing.loop import push_box_loop
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
-from vpsto_ros.collision.planar import MovingDisc
+from vpsto_ros.collision.planar_discs import MovingDisc
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel, push_directions
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
+from vpsto_ros.planning.joint_space import JointSpaceMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch
 from vpsto_ros.trajectory.key_timing import time_key_positions
@@ -68,8 +70,8 @@ def plan_in_clutter() -> None:
     world.clearance(trajectory(np.linspace(0.0, trajectory.duration, 5)))
     world.inside(ends[0])
     world.explain(trajectory)
-    for baseline in (False, True):
-        mpc_runs.warm_up(baseline)
+    for controller in (JointSpaceMpcConfig(), MppiConfig()):
+        run_task(Task(controller, "warm-up", "start_0.10_0.20", True, seed=0, longest=0.15))
 
 
 def plan_in_a_cell() -> None:

@@ -6,14 +6,15 @@ import math
 import numpy as np
 import pytest
 
+from vpsto_ros.collision.planar import PlanarWorld
+from vpsto_ros.collision.planar_discs import DiscMargin, MovingDisc
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError, VpstoError
 from vpsto_ros.optimization.costs import CostWeights
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig, OnlineJointSpaceProblem
 from vpsto_ros.planning.mpc import OnlineConfig
-from vpsto_ros.planning.stitching import as_batch, remainder
-from vpsto_ros.planning.table_path import extended
-from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize, synthesize_batch
+from vpsto_ros.planning.stitching import as_batch, extended, remainder
+from vpsto_ros.trajectory import Limits, OptimalBasis, synthesize, synthesize_batch
 
 PERIOD = 0.1
 LIMITS = Limits(
@@ -233,10 +234,54 @@ def test_a_robot_at_its_goal_holds_until_something_comes():
     assert mpc.step(2 * PERIOD, GOAL, (ball,)).mode in ("escape", "explore", "warm_start", "stop")
 
 
+@pytest.mark.parametrize("goal_in", ["polygon", "still ball"])
+def test_a_goal_inside_what_does_not_move_is_refused(goal_in):
+    still = Ball(GOAL, 0.2)
+    still.static = True
+    limits = Limits(LIMITS.velocity[:2], LIMITS.acceleration[:2])
+    square = np.array([[0.8, -0.2], [1.2, -0.2], [1.2, 0.2], [0.8, 0.2]])
+    wall = PlanarWorld(np.full(2, -5.0), np.full(2, 5.0), (square,), names=("the square",)).term()
+    if goal_in == "polygon":
+        mpc, goal, term, words = planner(start=START[:2], limits=limits), GOAL[:2], wall, "the square all along"
+    else:
+        mpc, goal, term, words = planner(), GOAL, still, r"goal \(1, 0, 0.1\): in collision"
+    before = mpc.reference
+    with pytest.raises(InvalidInputError, match=words):
+        mpc.step(PERIOD, goal, (term,))
+    assert mpc.reference is before
+    beside = goal - np.eye(len(goal))[0] * 0.4
+    assert mpc.step(PERIOD, beside, (term,)).valid
+    still.static = False  # it may be gone by then
+    assert goal_in == "polygon" or not mpc.step(PERIOD, goal, (term,)).valid
+
+
+def test_a_goal_that_a_moving_disc_covers_is_not_refused():
+    disc = MovingDisc(GOAL[:2], 0.2, (0.1, 0.0))
+    world = PlanarWorld(np.full(2, -5.0), np.full(2, 5.0), discs=(disc,))
+    for term in (world.term(), DiscMargin((disc,), 0.1, 0.0, 0.3)):
+        mpc = planner(start=START[:2], limits=Limits(LIMITS.velocity[:2], LIMITS.acceleration[:2]))
+        assert mpc.step(PERIOD, GOAL[:2], (term,)).mode
+
+
+@pytest.mark.parametrize(
+    ("takeover", "message"),
+    [(0.9, "the present motion begins, at 1 s"), (np.nan, "finite"), (np.inf, "finite"), ("ab", "finite")],
+)
+def test_bad_takeovers_are_refused(takeover, message):
+    mpc = JointSpaceMpc(LIMITS, config(), np.random.default_rng(0))
+    mpc.begin(START, 1.0)
+    with pytest.raises(InvalidInputError, match=message):
+        mpc.step(takeover, GOAL)
+    assert mpc.step(1.0, GOAL).valid
+
+
 def test_takes_over_a_moving_robot_by_braking():
     velocity = np.array([0.7, -0.2, 0.0])  # joint 1 is beyond its limit
     mpc = planner(velocity=velocity)
     np.testing.assert_allclose(mpc.reference(0.0, 1), velocity)
+    speed = np.abs(mpc.reference(np.linspace(0.0, mpc.reference.end_time, 100), 1))
+    assert (np.diff(speed, axis=0) <= 1e-12).all() and (speed[-1] < 1e-12).all(), "it only gets slower"
+    assert np.abs(mpc.reference(0.0, 2)) == pytest.approx(LIMITS.acceleration * [1.0, 0.38, 0.0], rel=0.01)
     plan = mpc.step(0.05, GOAL)
     assert plan.mode == "follow" and not plan.valid
     mpc.accept(plan)
@@ -275,31 +320,12 @@ def test_a_running_motion_is_measured_like_a_candidate():
     assert cost == pytest.approx(evaluation.cost[0], rel=1e-9) and valid == evaluation.valid[0]
 
 
-def test_a_quintic_cannot_be_measured_as_a_batch():
-    bent = Trajectory.from_points(
-        np.array([0.0, 1.0]), np.zeros((2, 1)), np.ones((2, 1)), np.array([[3.0], [0.0]])
-    )
-    with pytest.raises(InvalidInputError, match="cubic"):
-        as_batch(bent, 10)
-
-
-def test_the_remainder_of_a_motion_is_that_motion():
-    trajectory = synthesize(
-        OptimalBasis.uniform(2), np.random.default_rng(1).uniform(-1, 1, (4, 3)), np.zeros(3), np.zeros(3),
-        LIMITS, start_time=1.0,
-    )  # fmt: skip
-    for start in (1.0, 1.0 + 1e-12, 1.7, trajectory.end_time - 1e-6, trajectory.end_time, 99.0):
-        rest = remainder(trajectory, start)
-        times = np.linspace(rest.start_time, rest.end_time, 50)
-        np.testing.assert_allclose(rest(times), trajectory(times), atol=1e-12)
-        np.testing.assert_allclose(rest(times, 1), trajectory(times, 1), atol=1e-9)
-        assert rest.start_time == pytest.approx(start, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
         (np.zeros(2), r"shape \(3,\)"),
+        ("ab", r"shape \(3,\)"),
+        (None, r"shape \(3,\)"),
         (np.array([0.0, np.nan, 0.0]), "finite"),
         (np.array([0.0, 0.0, 2.5]), "joint 3 is above its limit 2"),
         (np.array([0.0, -2.1, 0.0]), "joint 2 is below its limit -2"),
@@ -318,6 +344,9 @@ def test_a_planner_must_be_told_where_the_robot_is():
         mpc.begin(np.zeros(2), 0.0)
     with pytest.raises(InvalidInputError):
         mpc.begin(np.zeros(3), 0.0, np.full(3, np.inf))
+    for arguments in (("abc", 0.0), (np.zeros(3), 0.0, "abc"), (np.zeros(3), np.nan), (np.zeros(3), None)):
+        with pytest.raises(InvalidInputError):
+            mpc.begin(*arguments)
 
 
 @pytest.mark.parametrize("options", [{"samples": 1}, {"spread": 0.0}, {"lookahead": -1.0}, {"escapes": 0}])

@@ -11,47 +11,18 @@ search that pays for phase settles on such a path now and then.
 import copy
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.collision import planar_kernels as kernels
+from vpsto_ros.collision import planar_kernels, planar_path_kernels
+from vpsto_ros.collision.planar_checks import items, number, planar, points_and_times, positive, vector
+from vpsto_ros.collision.planar_discs import MovingDisc, checked_discs, disc_rows
 from vpsto_ros.collision.planar_polygons import bands, checked_polygon, edge_rows
 from vpsto_ros.collision.planar_roots import from_powers
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory import Trajectory, TrajectoryBatch
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MovingDisc:
-    """A disc in uniform motion.
-
-    Args:
-        centre: position at time 0 of the clock that trajectories use, shape (2,) [m].
-        radius: [m], positive.
-        velocity: shape (2,) [m/s].
-
-    Raises:
-        InvalidInputError: an argument is not finite, has the wrong shape, or the radius is not positive.
-    """
-
-    centre: NDArray[np.float64]
-    radius: float
-    velocity: NDArray[np.float64] = (0.0, 0.0)  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "centre", _vector("disc: centre", self.centre))
-        object.__setattr__(self, "velocity", _vector("disc: velocity", self.velocity))
-        object.__setattr__(self, "radius", _positive_number("disc: radius", self.radius))
-
-    def position(self, time: float) -> NDArray[np.float64]:
-        """Centre at a time [s], shape (2,) [m]."""
-        return self.centre + time * self.velocity
-
-    def at(self, time: float) -> "MovingDisc":
-        """The disc as a clock sees it that starts at this time [s]."""
-        return MovingDisc(self.position(time), self.radius, self.velocity)
 
 
 class Stay(NamedTuple):
@@ -94,54 +65,61 @@ class PlanarWorld:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        lower = _vector("world: lower", self.lower, finite=False)
-        upper = _vector("world: upper", self.upper, finite=False)
+        lower = vector("world: lower", self.lower, finite=False)
+        upper = vector("world: upper", self.upper, finite=False)
         if not np.all(lower < upper):
             raise InvalidInputError(f"world: lower must be below upper, got {lower} and {upper}")
-        names = tuple(self.names) or tuple(f"polygon {i + 1}" for i in range(len(self.polygons)))
-        if len(names) != len(self.polygons):
-            raise InvalidInputError(f"world: {len(names)} names for {len(self.polygons)} polygons")
-        polygons = tuple(
-            checked_polygon(polygon, name) for polygon, name in zip(self.polygons, names, strict=True)
-        )
-        if not all(isinstance(disc, MovingDisc) for disc in self.discs):
-            raise InvalidInputError(f"world: discs must be MovingDisc objects, got {self.discs!r}")
+        polygons, names = items("world: polygons", self.polygons), items("world: names", self.names)
+        names = names or tuple(f"polygon {i + 1}" for i in range(len(polygons)))
+        if len(names) != len(polygons) or not all(isinstance(name, str) for name in names):
+            raise InvalidInputError(f"world: {names!r} are not the names of {len(polygons)} polygons")
+        polygons = tuple(map(checked_polygon, polygons, names))
         values = {"lower": lower, "upper": upper, "polygons": polygons, "names": names}
-        for name, value in {**values, "discs": tuple(self.discs)}.items():
+        for name, value in {**values, "discs": checked_discs(self.discs)}.items():
             object.__setattr__(self, name, value)
 
     @functools.cached_property
-    def packed(self) -> kernels.PackedWorld:
+    def packed(self) -> planar_kernels.PackedWorld:
         """The world as compiled kernels take it."""
         corners = [len(polygon) for polygon in self.polygons]
         boxes = [np.concatenate([p.min(axis=0), p.max(axis=0)]) for p in self.polygons]
-        return kernels.PackedWorld(
+        return planar_kernels.PackedWorld(
             edge_rows(self.polygons),
             np.concatenate([[0], np.cumsum(corners)]).astype(np.int64),
             np.array(boxes).reshape(-1, 4),
-            _disc_rows(self.discs),
+            disc_rows(self.discs),
             np.concatenate([self.lower, self.upper]),
         )
 
     def at(self, time: float) -> "PlanarWorld":
-        """The world as a clock sees it that starts at this time [s]: every disc has moved on."""
+        """The world as a clock sees it that starts at this time [s]: every disc has moved on.
+
+        Raises:
+            InvalidInputError: the time is not finite.
+        """
         return self.with_discs(tuple(disc.at(time) for disc in self.discs))
 
     def with_discs(self, discs: tuple[MovingDisc, ...]) -> "PlanarWorld":
-        """The same walls and polygons with other discs; cheap enough for every step of a control loop."""
+        """The same walls and polygons with other discs; cheap enough for every step of a control loop.
+
+        Raises:
+            InvalidInputError: it is no sequence of discs.
+        """
         world = copy.copy(self)
-        object.__setattr__(world, "discs", tuple(discs))
-        world.__dict__["packed"] = self.packed._replace(discs=_disc_rows(discs))
+        object.__setattr__(world, "discs", checked_discs(discs))
+        world.__dict__["packed"] = self.packed._replace(discs=disc_rows(world.discs))
         return world
 
     def inflated(self, radius: float) -> "PlanarWorld":
-        """The world as the centre of a round robot sees it, shape exact; obstacles overlap in the result.
+        """The world as the centre of a round robot sees it: all points nearer than `radius` [m] are occupied.
+
+        Exact, for every polygon: a rectangle along each edge and a disc at each corner join the obstacles, so
+        they overlap. Those discs come before the moving ones in the result.
 
         Raises:
             InvalidInputError: the radius is negative or not finite, or the robot does not fit into the box.
         """
-        if not (np.isfinite(radius) and radius >= 0.0):
-            raise InvalidInputError(f"the radius to inflate by must be finite and not negative, got {radius}")
+        radius = number("the radius to inflate by", radius, least=0.0)
         if radius == 0.0:
             return self
         polygons, names, discs = list(self.polygons), list(self.names), []
@@ -168,16 +146,16 @@ class PlanarWorld:
         Raises:
             InvalidInputError: a shape does not fit or a number is not finite.
         """
-        flat, clock, shape = _points_and_times(points, times)
-        return kernels.inside_any(self.packed, flat, clock).reshape(shape)
+        flat, clock, shape = points_and_times(points, times)
+        return planar_kernels.inside_any(self.packed, flat, clock).reshape(shape)
 
     def clearance(self, points: ArrayLike, times: ArrayLike | None = None) -> NDArray[np.float64]:
         """Distance to the nearest obstacle or wall, shape (...) [m]; inside one minus the way out of it.
 
         Arguments as for :meth:`inside`. Where obstacles overlap, the largest depth in one of them counts.
         """
-        flat, clock, shape = _points_and_times(points, times)
-        return kernels.clearances(self.packed, flat, clock).reshape(shape)
+        flat, clock, shape = points_and_times(points, times)
+        return planar_kernels.clearances(self.packed, flat, clock).reshape(shape)
 
     def time_in_collision(
         self, batch: TrajectoryBatch, start_time: float = 0.0
@@ -193,14 +171,13 @@ class PlanarWorld:
             whether it is zero, shape (B,) bool.
 
         Raises:
-            InvalidInputError: the trajectories do not have two degrees of freedom.
+            InvalidInputError: the trajectories do not have two degrees of freedom, or the start time is not
+                finite.
         """
-        if batch.key_positions.shape[2] != 2:
-            raise InvalidInputError(
-                f"a planar world takes 2 degrees of freedom, not {batch.key_positions.shape[2]}"
-            )
-        seconds = kernels.times_in_collision(
-            self.packed, batch.knots, batch.key_positions, batch.knot_slopes, batch.duration, start_time
+        planar(batch.key_positions.shape[2])
+        start = number("start time", start_time)
+        seconds = planar_path_kernels.times_in_collision(
+            self.packed, batch.knots, batch.key_positions, batch.knot_slopes, batch.duration, start
         )
         return seconds, seconds == 0.0
 
@@ -210,18 +187,12 @@ class PlanarWorld:
         Raises:
             InvalidInputError: the trajectory does not have two degrees of freedom.
         """
-        if trajectory.dof != 2:
-            raise InvalidInputError(f"a planar world takes 2 degrees of freedom, not {trajectory.dof}")
+        planar(trajectory.dof)
         sizes = np.diff(trajectory.times)[:, None, None]
         powers = trajectory.coefficients * sizes ** np.arange(trajectory.coefficients.shape[1])[:, None]
-        rows = kernels.stays(self.packed, from_powers(powers), trajectory.times)
+        rows = planar_path_kernels.stays(self.packed, from_powers(powers), trajectory.times)
         names = [*self.names, *(f"disc {i + 1}" for i in range(len(self.discs))), "the walls"]
         return sorted((Stay(names[o], start, end) for o, start, end in rows), key=lambda stay: stay.start)
-
-    def first_contact(self, trajectory: Trajectory) -> float | None:
-        """First instant in collision on the trajectory's own clock [s], or None; exact for every instant."""
-        stays = self.stays(trajectory)
-        return stays[0].start if stays else None
 
     def explain(self, trajectory: Trajectory) -> list[str]:
         """What a trajectory collides with, when and how deep, in words."""
@@ -236,9 +207,12 @@ class PlanarWorld:
             )
         return lines
 
-    def term(self, weight: float = 100.0, start_time: float = 0.0) -> "CollisionTerm":
-        """The constraint to stay out of collision, for the terms of a problem."""
-        return CollisionTerm(self, weight, start_time)
+    def term(self, weight: float = 100.0) -> "CollisionTerm":
+        """The constraint to stay out of collision, for the terms of a problem.
+
+        Trajectories start as the clock of the discs does; for a later start take the term of :meth:`at`.
+        """
+        return CollisionTerm(self, weight)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -246,22 +220,20 @@ class CollisionTerm:
     """A world as a cost term: the weight times the time in collision, and validity.
 
     Attributes:
-        world: what to stay out of.
+        world: what to stay out of; its clock starts with the trajectories.
         weight: cost of a second in collision; well above the cost of a second of motion [1/s].
-        start_time: when trajectories start, on the clock of the discs [s].
 
     Raises:
-        InvalidInputError: the weight is not positive, or a number is not finite.
+        InvalidInputError: the world is none, or the weight is not finite and positive.
     """
 
     world: PlanarWorld
     weight: float = 100.0
-    start_time: float = 0.0
 
     def __post_init__(self) -> None:
-        _positive_number("collision term: weight", self.weight)
-        if not np.isfinite(self.start_time):
-            raise InvalidInputError(f"collision term: start time must be finite, got {self.start_time!r}")
+        if not isinstance(self.world, PlanarWorld):
+            raise InvalidInputError(f"collision term: world must be a PlanarWorld, got {self.world!r}")
+        object.__setattr__(self, "weight", positive("collision term: weight", self.weight))
 
     @property
     def static(self) -> bool:
@@ -270,51 +242,9 @@ class CollisionTerm:
 
     def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Cost (B,) and validity (B,) of trajectories."""
-        seconds, valid = self.world.time_in_collision(batch, self.start_time)
+        seconds, valid = self.world.time_in_collision(batch)
         return self.weight * seconds, valid
 
     def explain(self, trajectory: Trajectory) -> list[str]:
-        """What a trajectory collides with, in words; its start counts as the start time of this term."""
-        moved = trajectory.shifted(self.start_time - trajectory.start_time)
-        return self.world.explain(moved)
-
-
-def _disc_rows(discs: tuple[MovingDisc, ...]) -> NDArray[np.float64]:
-    rows = [(*disc.centre, *disc.velocity, disc.radius) for disc in discs]
-    return np.array(rows, dtype=np.float64).reshape(-1, 5)
-
-
-def _vector(name: str, value: ArrayLike, finite: bool = True) -> NDArray[np.float64]:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name} must be two numbers, got {value!r}") from error
-    if array.shape != (2,) or not np.all(np.isfinite(array) if finite else ~np.isnan(array)):
-        raise InvalidInputError(f"{name} must be two {'finite ' if finite else ''}numbers, got {value!r}")
-    array.setflags(write=False)
-    return array
-
-
-def _positive_number(name: str, value: Any) -> float:
-    if isinstance(value, (int, float, np.number)) and np.isfinite(value) and value > 0:
-        return float(value)
-    raise InvalidInputError(f"{name} must be finite and positive, got {value!r}")
-
-
-def _points_and_times(
-    points: ArrayLike, times: Any
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, ...]]:
-    """Points (K, 2) and times (K,), contiguous, and the shape of the answer."""
-    array = np.asarray(points, dtype=np.float64)
-    if array.ndim < 1 or array.shape[-1] != 2 or not np.isfinite(array).all():
-        raise InvalidInputError(f"points must be finite with shape (..., 2), got {np.shape(points)}")
-    shape = array.shape[:-1]
-    try:
-        clock = np.broadcast_to(np.asarray(0.0 if times is None else times, dtype=np.float64), shape)
-    except ValueError as error:
-        raise InvalidInputError(
-            f"times of shape {np.shape(times)} do not fit points of shape {array.shape}"
-        ) from error
-    if not np.isfinite(clock).all():
-        raise InvalidInputError("times must be finite")
-    return np.ascontiguousarray(array.reshape(-1, 2)), np.ascontiguousarray(clock.reshape(-1)), shape
+        """What a trajectory collides with, in words; the clock of the discs starts as it does."""
+        return self.world.explain(trajectory.shifted(-trajectory.start_time))

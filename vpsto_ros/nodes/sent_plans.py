@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vpsto_ros.planning.pushing import AT_REST as MEASURED_REST
 from vpsto_ros.planning.pushing import MpcStep
-from vpsto_ros.planning.table_path import extended
+from vpsto_ros.planning.stitching import extended
 from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory
 
 POSITION_MATCH = 1e-3

@@ -18,10 +18,10 @@ from vpsto_ros.exceptions import InvalidInputError, VpstoError
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem, Term
 from vpsto_ros.optimization.vpsto import Evaluation, SearchResult, VpstoConfig
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineVpsto
-from vpsto_ros.planning.stitching import as_batch, remainder
-from vpsto_ros.planning.table_path import extended
+from vpsto_ros.planning.stitching import as_batch, extended, remainder, resting
 from vpsto_ros.priors.smoothness import GaussianPrior
 from vpsto_ros.trajectory import (
+    MINIMUM_DURATION,
     Limits,
     OptimalBasis,
     Trajectory,
@@ -175,7 +175,9 @@ class JointSpaceMpc:
     Safety: the executed motion is only replaced by a valid plan of lower cost, and goes on otherwise. When an
     obstacle has moved into it and no valid plan is found, the first of these that is clear for ``lookahead``
     seconds is taken: going on, braking, a short motion out of the way; without any, the one that breaks
-    least. All of them end at rest, and velocity and acceleration limits hold on all of them.
+    least. All of them end at rest, and velocity and acceleration limits hold on all of them. The exception
+    is a robot that is taken over faster than its velocity limit: :meth:`begin` brakes it as hard as the
+    acceleration limits allow, what is too fast only gets slower, and plans follow once it is within limits.
     """
 
     def __init__(self, limits: Limits, config: JointSpaceMpcConfig, rng: np.random.Generator) -> None:
@@ -202,13 +204,14 @@ class JointSpaceMpc:
         Args:
             position: shape (n,).
             now: present time [s].
-            velocity: shape (n,), zero by default.
+            velocity: shape (n,), zero by default; it may be beyond its limit, see the class.
 
         Raises:
             InvalidInputError: a shape does not fit or a number is not finite.
         """
-        speed = np.zeros(self.limits.dof) if velocity is None else velocity
-        self._reference = braking_trajectory(position, speed, self.limits, start_time=now)
+        place = self._vector("the position", position)
+        speed = np.zeros(self.limits.dof) if velocity is None else self._vector("the velocity", velocity)
+        self._reference = braking_trajectory(place, speed, self.limits, start_time=_finite("now", now))
         self._solved = False
         return self._reference
 
@@ -238,10 +241,13 @@ class JointSpaceMpc:
             clock: source of that time.
 
         Raises:
-            InvalidInputError: the goal has another shape, is not finite or beyond its limits.
+            InvalidInputError: the goal has another shape, is not finite, beyond its limits or inside an
+                obstacle that does not move (a term with ``static = True``, on the term itself or the object
+                whose method it is); or the takeover is not finite or before the present motion begins. The
+                present motion, which ends at rest, stays the one being executed.
             VpstoError: nothing is being executed yet.
         """
-        kept, goal = remainder(self.reference, takeover), self._checked(goal)
+        kept, goal = self._kept(takeover), self._checked(goal, terms)
         problem = self._posed = self._problem(kept, goal, terms)
         judge = problem if tolerated is None else self._problem(kept, goal, tolerated)
         cost, clear = judge.assess(kept)
@@ -266,11 +272,28 @@ class JointSpaceMpc:
             return []
         return self._posed.plain(len(best)).explain(best)
 
-    def _checked(self, goal: ArrayLike) -> NDArray:
+    def _kept(self, takeover: float) -> Trajectory:
+        """What is left of the present motion at the takeover."""
+        begin = self.reference.start_time
+        if _finite("the takeover", takeover) < begin - 1e-9:
+            raise InvalidInputError(
+                f"the takeover at {takeover:.6g} s is before the present motion begins, at {begin:.6g} s"
+            )
+        return remainder(self.reference, takeover)
+
+    def _vector(self, name: str, value: ArrayLike) -> NDArray:
+        """A number for each joint."""
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            array = np.empty(0)
+        if array.shape != (self.limits.dof,) or not np.isfinite(array).all():
+            raise InvalidInputError(f"{name} must be finite with shape ({self.limits.dof},), got {value!r}")
+        return array
+
+    def _checked(self, goal: ArrayLike, terms: tuple[Term, ...]) -> NDArray:
         """The goal, refused if no motion could end there."""
-        target, limits = np.array(goal, dtype=float), self.limits
-        if target.shape != (limits.dof,) or not np.isfinite(target).all():
-            raise InvalidInputError(f"the goal must be finite with shape ({limits.dof},), got {goal!r}")
+        target, limits = self._vector("the goal", goal), self.limits
         for bound, beyond, side in ((limits.lower, np.less, "below"), (limits.upper, np.greater, "above")):
             if bound is not None and beyond(target, bound).any():
                 joint = int(np.argmax(beyond(target, bound)))
@@ -278,6 +301,14 @@ class JointSpaceMpc:
                     f"the goal {target[joint]:.6g} of joint {joint + 1} is {side} its limit "
                     f"{bound[joint]:.6g}"
                 )
+        standing = resting(target, 0.0, MINIMUM_DURATION)
+        for term in terms:
+            owner = getattr(term, "__self__", term)
+            if getattr(owner, "static", False) and not term(as_batch(standing, self.config.samples))[1][0]:
+                explain = getattr(owner, "explain", None)
+                reasons = [] if explain is None else explain(standing)
+                where = ", ".join(f"{value:.4g}" for value in target)
+                raise InvalidInputError(f"the goal ({where}): {'; '.join(reasons) or 'in collision'}")
         return target
 
     def _problem(self, kept: Trajectory, goal: NDArray, terms: tuple[Term, ...]) -> OnlineJointSpaceProblem:
@@ -328,3 +359,10 @@ class JointSpaceMpc:
             synthesize(basis, keys[i], judge.velocity, still, limits, start_time=judge.start_time)
             for i in order[:MOST_ESCAPES]
         ]
+
+
+def _finite(name: str, value: float) -> float:
+    """A finite number; anything else is refused."""
+    if isinstance(value, (int, float, np.number)) and math.isfinite(value):
+        return float(value)
+    raise InvalidInputError(f"{name} must be a finite time, got {value!r}")

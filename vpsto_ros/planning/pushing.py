@@ -23,8 +23,9 @@ from vpsto_ros.planning.mpc import OnlineResult, OnlineVpsto
 from vpsto_ros.planning.pushes import PushRanking
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
 from vpsto_ros.planning.pushing_problem import PushingProblem
+from vpsto_ros.planning.stitching import extended, resting
 from vpsto_ros.planning.table_entry import enter_plane
-from vpsto_ros.planning.table_path import TablePath, extended, resting
+from vpsto_ros.planning.table_path import TablePath
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import Robot
 from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory

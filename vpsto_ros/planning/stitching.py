@@ -1,10 +1,25 @@
-"""Parts of motions: what is left of one, and one in the form in which candidates are measured."""
+"""Motions joined and cut: at rest, extended, what is left of one, and one as candidates are measured."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.planning.table_path import resting
 from vpsto_ros.trajectory import MINIMUM_DURATION, Trajectory, TrajectoryBatch
+
+
+def resting(position: NDArray, start: float, end: float) -> Trajectory:
+    """A trajectory that stays at one position from `start` to `end` [s]."""
+    return Trajectory.from_points(
+        np.array([start, end]), np.stack([position] * 2), np.zeros((2, len(position)))
+    )
+
+
+def extended(trajectory: Trajectory, end: float) -> Trajectory:
+    """The trajectory, resting at its last position until `end` if it is over earlier."""
+    if trajectory.end_time >= end - 1e-9:
+        return trajectory
+    last = trajectory(trajectory.end_time)
+    return trajectory.followed_by(resting(last, trajectory.end_time, end))
 
 
 def remainder(trajectory: Trajectory, start: float) -> Trajectory:

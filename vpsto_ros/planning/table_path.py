@@ -15,21 +15,6 @@ STRETCHES = (1.0, 1.02, 1.05, 1.1, 1.2, 1.4)
 """Durations to try, relative to that of the motion in the plane."""
 
 
-def resting(position: NDArray, start: float, end: float) -> Trajectory:
-    """A trajectory that stays at one position from `start` to `end` [s]."""
-    return Trajectory.from_points(
-        np.array([start, end]), np.stack([position] * 2), np.zeros((2, len(position)))
-    )
-
-
-def extended(trajectory: Trajectory, end: float) -> Trajectory:
-    """The trajectory, resting at its last position until `end` if it is over earlier."""
-    if trajectory.end_time >= end - 1e-9:
-        return trajectory
-    last = trajectory(trajectory.end_time)
-    return trajectory.followed_by(resting(last, trajectory.end_time, end))
-
-
 @dataclasses.dataclass(frozen=True)
 class TablePath:
     """Maps plane trajectories to joint trajectories through dense key positions.

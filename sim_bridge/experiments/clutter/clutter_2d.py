@@ -14,7 +14,6 @@ Every result is checked twice: at every instant, from the roots of its polynomia
 
 import argparse
 import dataclasses
-import functools
 import pathlib
 import time
 from typing import Any
@@ -32,6 +31,7 @@ from sim_bridge.experiments.runs import (
     run_trials,
     write_summary,
 )
+from sim_bridge.warm_up import plan_in_clutter
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
@@ -124,7 +124,6 @@ def problem(start: NDArray, goal: NDArray, n_via: int) -> JointSpaceProblem:
 
 def solve(task: Task) -> Outcome:
     """Search, then look at the result in other ways than the search does."""
-    _compiled()
     plan, rng = task.problem, np.random.default_rng(task.seed)
     begin = time.thread_time()
     result = search(plan.prior(spread=SPREAD), plan.evaluate, task.config, rng)
@@ -140,15 +139,6 @@ def solve(task: Task) -> Outcome:
         points, not reasons, int(CLUTTER.inside(samples).sum()), trajectory.duration, homotopy_class(samples),
         settled, milliseconds, reasons,
     )  # fmt: skip
-
-
-@functools.cache
-def _compiled() -> None:
-    """Load the kernels, which the first search of a process would otherwise be charged with."""
-    plan = problem(STARTS["start_0.10_0.20"], GOAL, 1)
-    result = search(plan.prior(), plan.evaluate, VpstoConfig(iterations=2), np.random.default_rng(0))
-    assert result.best_any_points is not None
-    CLUTTER.inside(plan.trajectory(result.best_any_points)(np.zeros(1)))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -172,10 +162,13 @@ def run(arguments: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     results = {}
     for name, start in starts.items():
-        plain = run_trials(solve, _tasks(start, goal, N_VIA, PLAIN, seeds), execution, name)
+        plain = run_trials(solve, _tasks(start, goal, N_VIA, PLAIN, seeds), execution, name, plan_in_clutter)
         few = seeds[: max(1, len(seeds) // 10)]
         more = {
-            n: run_trials(solve, _tasks(start, goal, n, LONG, few), execution, f"{name}, {n} via-points")
+            n: run_trials(
+                solve, _tasks(start, goal, n, LONG, few), execution, f"{name}, {n} via-points",
+                plan_in_clutter,
+            )  # fmt: skip
             for n in MORE_VIA_POINTS
         }
         results[name] = summarise(plain, more)

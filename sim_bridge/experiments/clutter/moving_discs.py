@@ -1,4 +1,4 @@
-"""Discs that move through the cluttered plane, what a planner sees of them, and how it keeps away.
+"""Discs that move through the cluttered plane, and what a planner sees of them.
 
 A disc moves in a straight line and is reflected where it meets the border of its region. The planner measures
 where the discs are and how fast they move, with noise; it knows neither regions nor turns.
@@ -14,12 +14,12 @@ import itertools
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL
-from vpsto_ros.collision.planar import MovingDisc, PlanarWorld, Stay
-from vpsto_ros.trajectory import Trajectory, TrajectoryBatch
+from vpsto_ros.collision.planar import PlanarWorld, Stay
+from vpsto_ros.collision.planar_discs import MovingDisc
+from vpsto_ros.trajectory import Trajectory
 
 REGION = np.array([[0.17, 0.0], [0.5, 0.5]])
 """Where discs move: lowest and highest x and y [m]."""
@@ -113,85 +113,9 @@ def stays(discs: tuple[BouncingDisc, ...], motion: Trajectory) -> list[Stay]:
 
 def _world_between(discs: tuple[BouncingDisc, ...], begin: float, end: float) -> PlanarWorld:
     """The world while no disc turns; its clock is that of the run."""
+    middle = 0.5 * (begin + end)
     straight = []
     for disc in discs:
-        middle = 0.5 * (begin + end)
         position, velocity = disc.state(middle)
-        straight.append(MovingDisc(position - middle * velocity, disc.radius, velocity))
-    return CLUTTER.with_discs(tuple(straight))
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class DiscMargin:
-    """The constraint to keep away from discs that may turn at any moment.
-
-    For a look-ahead time t the distance to where a disc is predicted to be must be its radius plus ``margin +
-    2 |v| min(t, reaction)``: a disc that turns back now is 2 |v| t from its prediction, and after the
-    reaction time the robot has seen it and given way. Checked by steps as long as the gap allows at the
-    highest closing speed, so nothing deeper than a fraction of a millimetre is missed.
-
-    Attributes:
-        discs: as measured; their clocks start at the measurement.
-        delay: time from the measurement to the start of the trajectories [s].
-        margin: [m].
-        reaction: [s].
-        speed: greatest speed of the robot [m/s].
-        weight: cost of a path that is too near all along.
-    """
-
-    discs: tuple[MovingDisc, ...]
-    delay: float
-    margin: float
-    reaction: float
-    speed: float
-    weight: float = 100.0
-
-    def __call__(self, batch: TrajectoryBatch) -> tuple[NDArray, NDArray]:
-        """Cost (B,) and validity (B,) of trajectories."""
-        rows = np.array([(*d.centre, *d.velocity, d.radius) for d in self.discs]).reshape(-1, 5)
-        share = time_too_near(
-            batch.knots, batch.key_positions, batch.knot_slopes, batch.duration, rows,
-            self.delay, self.margin, self.reaction, self.speed,
-        )  # fmt: skip
-        return self.weight * share, share == 0.0
-
-
-SHORTEST_STEP = 0.002
-"""Step [s] while too near, and the least one otherwise."""
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def time_too_near(knots, keys, slopes, durations, discs, delay, margin, reaction, speed):
-    """Share of its duration (B,) that each trajectory is too near to discs, summed over the discs."""
-    shares = np.zeros(len(keys))
-    for b in range(len(keys)):
-        duration = durations[b]
-        if not np.isfinite(duration):
-            shares[b] = np.inf
-            continue
-        for d in range(len(discs)):
-            x, y, vx, vy, radius = discs[d]
-            disc_speed = math.hypot(vx, vy)
-            time, i = 0.0, 0
-            while time <= duration:
-                s = min(time / duration, 1.0)
-                while s > knots[i + 1]:
-                    i += 1
-                h = knots[i + 1] - knots[i]
-                u = (s - knots[i]) / h
-                px = _cubic(keys[b, i, 0], keys[b, i + 1, 0], h * slopes[b, i, 0], h * slopes[b, i + 1, 0], u)
-                py = _cubic(keys[b, i, 1], keys[b, i + 1, 1], h * slopes[b, i, 1], h * slopes[b, i + 1, 1], u)
-                ahead = delay + time
-                needed = radius + margin + 2.0 * disc_speed * min(ahead, reaction)
-                gap = math.hypot(px - x - ahead * vx, py - y - ahead * vy) - needed
-                if gap < 0.0:
-                    shares[b] += SHORTEST_STEP / duration
-                time += max(gap / (speed + 3.0 * disc_speed), SHORTEST_STEP)
-    return shares
-
-
-@njit(cache=True, nogil=True)
-def _cubic(left, right, left_slope, right_slope, u):
-    """Cubic Hermite polynomial on 0 <= u <= 1."""
-    rise = u * u * (3.0 - 2.0 * u)
-    return left + rise * (right - left) + u * (1.0 - u) * ((1.0 - u) * left_slope - u * right_slope)
+        straight.append(MovingDisc(position, disc.radius, velocity))
+    return CLUTTER.with_discs(tuple(straight)).at(-middle)

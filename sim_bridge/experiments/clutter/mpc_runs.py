@@ -5,7 +5,6 @@ measurement takes effect one period later, when the decision has been computed.
 """
 
 import dataclasses
-import functools
 import time
 from collections import Counter
 from typing import Protocol
@@ -13,19 +12,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.clutter.moving_discs import (
-    BouncingDisc,
-    DiscMargin,
-    measured,
-    random_discs,
-    stays,
-)
-from sim_bridge.experiments.clutter.mppi import Mppi, MppiConfig, grown
+from sim_bridge.experiments.clutter.moving_discs import BouncingDisc, measured, random_discs, stays
+from sim_bridge.experiments.clutter.mppi import Mppi, MppiConfig
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
-from vpsto_ros.collision.planar import MovingDisc
+from vpsto_ros.collision.planar_discs import DiscMargin, MovingDisc
 from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig
-from vpsto_ros.planning.stitching import remainder
-from vpsto_ros.planning.table_path import extended
+from vpsto_ros.planning.stitching import extended, remainder
 from vpsto_ros.trajectory import Trajectory
 
 PERIOD = 0.05
@@ -43,10 +35,7 @@ START_SPREAD = 0.005
 ALL_STARTS = {**STARTS, "open": np.array([0.25, 0.3])}
 """The starts of the thesis's figure, and one from which nothing is in the way [m]."""
 
-SPEED = float(np.hypot(*LIMITS.velocity))
-"""Greatest speed of the robot [m/s]."""
-
-MPPI_MARGIN = 0.003
+MPPI_MARGIN = 0.004
 """What the baseline keeps away from obstacles [m]: it looks at points up to 7 mm apart, not in between."""
 
 
@@ -117,7 +106,6 @@ class Controller(Protocol):
 
 def run_task(task: Task) -> Result:
     """Simulate one run."""
-    warm_up(isinstance(task.controller, MppiConfig))
     rng = np.random.default_rng([task.seed, list(ALL_STARTS).index(task.start), int(task.moving)])
     start = ALL_STARTS[task.start] + rng.uniform(-START_SPREAD, START_SPREAD, 2)
     discs = random_discs(rng, start, task.longest) if task.moving else ()
@@ -148,17 +136,6 @@ def _controller(
     return VpstoController(config, start, rng)
 
 
-@functools.cache
-def warm_up(baseline: bool) -> None:
-    """Compile the kernels of a controller, so that no step of a run has to."""
-    config = MppiConfig() if baseline else JointSpaceMpcConfig()
-    controller = _controller(config, STARTS["start_0.10_0.20"], np.random.default_rng(0))
-    for discs in ([], [MovingDisc(np.full(2, 0.3), 0.02, np.full(2, 0.01))]):
-        for k in range(3):
-            controller.step((k + 1) * PERIOD, discs)
-            controller.executed(k * PERIOD, (k + 1) * PERIOD)
-
-
 class VpstoController:
     """Online VP-STO."""
 
@@ -172,8 +149,8 @@ class VpstoController:
     def step(self, takeover: float, discs: list[MovingDisc]) -> None:
         """Plan from the state one period ahead; new plans keep more distance than the present one has to."""
         self._present = self.planner.reference
-        careful = DiscMargin(tuple(discs), PERIOD, 0.010, 0.4, SPEED)
-        just = DiscMargin(tuple(discs), PERIOD, 0.006, 0.3, SPEED)
+        careful = DiscMargin(tuple(discs), PERIOD, margin=0.010, reaction=0.4)
+        just = DiscMargin(tuple(discs), PERIOD, margin=0.006, reaction=0.3)
         terms = (self._static, careful) if discs else (self._static,)
         tolerated = (self._static, just) if discs else None
         plan = self.planner.step(takeover, GOAL, terms, tolerated=tolerated)
@@ -194,17 +171,17 @@ class MppiController:
         self.mode = "sample"
         self._position, self._velocity = start, np.zeros(2)
         self._present, self._next = np.zeros(2), np.zeros(2)
-        self._world = grown(CLUTTER, MPPI_MARGIN)
+        self._world = CLUTTER.inflated(MPPI_MARGIN)
 
     def step(self, takeover: float, discs: list[MovingDisc]) -> None:
         """Choose the acceleration of the period after this one."""
         self._present = self._next
         position, velocity = self._moved()
         wider = [
-            MovingDisc(d.position(PERIOD), d.radius + 0.01 + 0.4 * float(np.hypot(*d.velocity)), d.velocity)
-            for d in discs
+            dataclasses.replace(d, radius=d.radius + 0.01 + 0.4 * float(np.hypot(*d.velocity))) for d in discs
         ]
-        self._next = self.mppi.step(position, velocity, GOAL, self._world.with_discs(tuple(wider)))
+        world = self._world.with_discs((*self._world.discs, *wider)).at(PERIOD)
+        self._next = self.mppi.step(position, velocity, GOAL, world)
 
     def executed(self, begin: float, end: float) -> Trajectory:
         """The motion of one period; the next one begins where it ends."""

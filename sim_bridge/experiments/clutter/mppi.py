@@ -9,13 +9,12 @@ settles at the goal more slowly, and not at all with long horizons.
 """
 
 import dataclasses
-import math
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vpsto_ros.collision.planar import MovingDisc, PlanarWorld
+from vpsto_ros.collision.planar import PlanarWorld
 from vpsto_ros.configuration import option, validate
 from vpsto_ros.trajectory import Limits
 
@@ -75,7 +74,7 @@ class Mppi:
             position: when it will be applied, shape (n,).
             velocity: at that time, shape (n,), within its limits.
             goal: where to come to rest, shape (n,).
-            world: obstacles, with the margin to keep (see :func:`grown`); discs as they are at that time.
+            world: obstacles, inflated by the margin to keep; discs as they are at that time.
         """
         for _ in range(self.config.iterations):
             samples, cost = self._sample(position, velocity, goal, world)
@@ -134,23 +133,3 @@ def simulate(position, velocity, wanted, period, fastest, strongest):
                 v = after
                 velocities[m, k, j], positions[m, k, j] = v, q
     return velocities, positions
-
-
-def grown(world: PlanarWorld, margin: float) -> PlanarWorld:
-    """The world with the edges of its polygons moved outwards, and the walls inwards, by a margin [m].
-
-    Corners stay corners, so this costs no more to check, and keeps a little more away from them than needed.
-    """
-    polygons = []
-    for polygon in world.polygons:
-        along = np.roll(polygon, -1, axis=0) - polygon
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        x, y = polygon.T
-        area = float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-        outward = math.copysign(1.0, area) * np.stack([along[:, 1], -along[:, 0]], axis=1)
-        before = np.roll(outward, 1, axis=0)
-        polygons.append(
-            polygon + margin * (outward + before) / (1.0 + (outward * before).sum(axis=1, keepdims=True))
-        )
-    discs = tuple(MovingDisc(disc.centre, disc.radius + margin, disc.velocity) for disc in world.discs)
-    return PlanarWorld(world.lower + margin, world.upper - margin, tuple(polygons), discs, world.names)
