@@ -1,10 +1,11 @@
 """The figure of the search experiment: gap to the best known over the values of every option."""
 
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
-from sim_bridge.experiments.search.statistics import Sample
+from sim_bridge.experiments.search.statistics import Rows
 from sim_bridge.experiments.search.variants import Choice
 
 COLUMNS = 5
@@ -12,11 +13,11 @@ COLUMNS = 5
 
 def draw(
     path: pathlib.Path,
-    choices: tuple[Choice, ...],
-    rows: dict[tuple[str, str], dict[str, Sample]],
+    choices: Sequence[Choice],
+    rows: Rows,
     titles: dict[str, str],
 ) -> None:
-    """One panel per option: median and 95 % interval per value and problem; the default is marked.
+    """One panel per option: median and 95 % interval per value and problem; the value in use is marked.
 
     Args:
         path: image file to write.
@@ -39,7 +40,7 @@ def draw(
             x = np.arange(len(percent)) + 0.12 * (k - 0.5 * (len(shown) - 1))
             axes.vlines(x, percent[:, 1], percent[:, 2], color=colours[name], lw=1.0)
             axes.plot(x, percent[:, 0], "o-", ms=3.5, lw=0.7, color=colours[name], label=titles[name])
-        marked = list(choice.values.values()).index({})
+        marked = list(choice.values).index(choice.in_use)
         axes.axvspan(marked - 0.45, marked + 0.45, color="0.9", zorder=0)
         axes.set_xticks(range(len(choice.values)), list(choice.values), rotation=25, ha="right", fontsize=8)
         axes.set_yscale("symlog", linthresh=0.1)

@@ -1,8 +1,9 @@
 """What the options of the search are compared on: problems with a fixed budget of evaluations each.
 
-A plane with obstacles and several local optima, with the budget of the thesis and with four times as much;
-seven joints in free space, time-optimal; one degree of freedom, time-optimal; and seven joints past two walls
-with narrow gaps, with a budget in which a valid motion is not certain.
+A plane with obstacles and several local optima, with the budget of the thesis and with four times as much,
+and the plain setting of Fig. 4.4 in it; seven joints in free space, time-optimal, with four and with nine
+via-points; one degree of freedom, time-optimal; and seven joints past two walls with narrow gaps, with a
+budget in which a valid motion is not certain.
 """
 
 import dataclasses
@@ -12,9 +13,12 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.experiments.clutter import clutter_2d
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from sim_bridge.experiments.timing.linear_program import optimal_duration
 from sim_bridge.experiments.timing.via_points import ONE, SEVEN
+from sim_bridge.warm_up import plan_in_clutter
+from vpsto_ros.optimization.cma import STRATEGIES
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
@@ -81,10 +85,15 @@ def problems() -> dict[str, BudgetedProblem]:
     return {
         "clutter": _clutter("plane with obstacles", 5000),
         "clutter_long": _clutter("the same, four times the budget", 20_000),
+        "clutter_plain": BudgetedProblem(
+            "the same, plain setting",
+            clutter_2d.problem(STARTS["start_0.10_0.20"], GOAL, clutter_2d.N_VIA), clutter_2d.SPREAD, 5000,
+        ),
         "arm": _time_optimal("seven joints, free", SEVEN, 4, 5000),
+        "arm_long": _time_optimal("the same, nine via-points", SEVEN, 9, 38_400),
         "line": _time_optimal("one joint, free", ONE, 6, 1500),
         "walls": _walls(),
-    }
+    }  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,16 +101,16 @@ class Task:
     """One search.
 
     Attributes:
-        problem: name of the problem.
-        name: which option has which value.
+        name: of the problem.
         config: options of the search; its number of iterations is ignored.
         seed: of the search.
+        spread: of the prior instead of the problem's own.
     """
 
-    problem: str
     name: str
     config: VpstoConfig
     seed: int
+    spread: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,24 +142,25 @@ class _Counted:
         return float(self.evaluations)
 
 
-def run_task(task: Task) -> Result:
-    """Search until the budget is used up."""
-    posed = problems()[task.problem]
-    warm_up(task.problem, task.config.strategy)
+def run_task(task: Task, budget: int | None = None) -> Result:
+    """Search until the budget, by default the problem's own, is used up."""
+    posed = problems()[task.name]
+    prior = posed.prior if task.spread is None else posed.problem.prior(spread=task.spread)
     counted = _Counted(posed.problem)
     # One more than the budget, because an iteration has to end before the deadline.
     config = dataclasses.replace(task.config, iterations=posed.budget)
+    budget = posed.budget if budget is None else budget
     begin = time.thread_time()
     result = search(
-        posed.prior, counted, config, np.random.default_rng(task.seed),
-        deadline=posed.budget + 1.0, clock=counted.clock,
+        prior, counted, config, np.random.default_rng(task.seed),
+        deadline=budget + 1.0, clock=counted.clock,
     )  # fmt: skip
     return Result(result.cost, result.evaluations, time.thread_time() - begin)
 
 
-@functools.cache
-def warm_up(name: str, strategy: str) -> None:
-    """Compile and import what a search needs, so that no run has to."""
-    posed = problems()[name]
-    config = VpstoConfig(iterations=2, strategy=strategy)
-    search(posed.prior, posed.problem.evaluate, config, np.random.default_rng(0))
+def warm_up() -> None:
+    """Pose all problems, and load what their searches need."""
+    plan_in_clutter()
+    for name in problems():
+        for strategy in STRATEGIES:
+            run_task(Task(name, VpstoConfig(strategy=strategy), 0), budget=64)

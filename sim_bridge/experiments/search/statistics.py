@@ -60,6 +60,10 @@ class Sample:
         }
 
 
+Rows = dict[tuple[str, str], dict[str, Sample]]
+"""Samples by problem, by the names of choice and value."""
+
+
 def lower(first: Sample, second: Sample, level: float) -> bool:
     """Whether the gaps of the first sample are lower than those of the second beyond chance."""
     if np.array_equal(first.gaps, second.gaps):
