@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from types import ModuleType
+from typing import NamedTuple
 
 from vpsto_ros import __version__
 from vpsto_ros.exceptions import VpstoError
@@ -24,18 +25,53 @@ examples:
 exit status: 0 success, 1 the run failed, 2 the command was not understood
 """
 
-DEMOS = {"push_box": "sim_bridge.demo.push_box"}
+
+class Choice(NamedTuple):
+    """What can be run: a module, and what it is about in a line."""
+
+    module: str
+    summary: str
+
+
+DEMOS = {"push_box": Choice("sim_bridge.demo.push_box", "a simulated FR3 pushes a box to a moving target")}
 EXPERIMENTS = {
-    "push_box": "sim_bridge.experiments.pushing.push_box",
-    "push_t": "sim_bridge.experiments.pushing.push_t",
-    "planning_space": "sim_bridge.experiments.pushing.planning_space",
-    "clutter_2d": "sim_bridge.experiments.clutter.clutter_2d",
-    "clutter_2d_mpc": "sim_bridge.experiments.clutter.clutter_2d_mpc",
-    "via_points": "sim_bridge.experiments.timing.via_points",
-    "cholesky": "sim_bridge.experiments.clutter.cholesky",
-    "key_timing": "sim_bridge.experiments.timing.key_timing",
-    "reach_clutter": "sim_bridge.experiments.reaching.reach_clutter",
-    "search": "sim_bridge.experiments.search.choices",
+    "push_box": Choice(
+        "sim_bridge.experiments.pushing.push_box",
+        "push boxes of unknown mass and friction to a goal",
+    ),
+    "push_t": Choice("sim_bridge.experiments.pushing.push_t", "push a T to any pose"),
+    "planning_space": Choice(
+        "sim_bridge.experiments.pushing.planning_space",
+        "search in the plane of the tool or in the seven joints",
+    ),
+    "clutter_2d": Choice(
+        "sim_bridge.experiments.clutter.clutter_2d",
+        "a point among three obstacles: ways found, time, success",
+    ),
+    "clutter_2d_mpc": Choice(
+        "sim_bridge.experiments.clutter.clutter_2d_mpc",
+        "the same at 20 Hz and among moving discs, beside MPPI",
+    ),
+    "via_points": Choice(
+        "sim_bridge.experiments.timing.via_points",
+        "how near to the optimum time-optimal moves come",
+    ),
+    "cholesky": Choice(
+        "sim_bridge.experiments.clutter.cholesky",
+        "what the smoothness prior does for the search",
+    ),
+    "key_timing": Choice(
+        "sim_bridge.experiments.timing.key_timing",
+        "free timing of key positions against equal spacing",
+    ),
+    "reach_clutter": Choice(
+        "sim_bridge.experiments.reaching.reach_clutter",
+        "the arm between random postures in cluttered cells",
+    ),
+    "search": Choice(
+        "sim_bridge.experiments.search.choices",
+        "every option of the search against its alternatives",
+    ),
 }
 
 
@@ -104,7 +140,7 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     experiment = commands.add_parser("experiment", help="repeat a task many times in lock-step, without ROS")
     experiments = _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, _experiment_arguments)
     if list(chosen[:1]) == ["experiment"] and chosen[1:2] and chosen[1] in EXPERIMENTS:
-        _load(EXPERIMENTS[chosen[1]]).add_arguments(experiments[chosen[1]])
+        _load(EXPERIMENTS[chosen[1]].module).add_arguments(experiments[chosen[1]])
     bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
     bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
     bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")
@@ -114,6 +150,9 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
         type=positive,
         metavar="X",
         help="exit with 1 if a row takes more than X times as long as in the file to compare with",
+    )
+    bench.add_argument(
+        "--check", action="store_true", help="exit with 1 if a row does not reach the figure wanted of it"
     )
     bench.add_argument("--quick", action="store_true", help="a few calls per row: does every row work?")
     bench.set_defaults(module="sim_bridge.bench")
@@ -125,16 +164,18 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
 def _add_modules(
     parser: argparse.ArgumentParser,
     noun: str,
-    modules: dict[str, str],
+    modules: dict[str, Choice],
     add_arguments: Callable[[argparse.ArgumentParser, str], None],
 ) -> dict[str, argparse.ArgumentParser]:
     """One subcommand per module; returns their parsers by name."""
-    names = parser.add_subparsers(
-        dest="name", metavar=noun, required=True, help="one of: " + ", ".join(modules)
-    )
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter  # keeps a line for each
+    width = max(map(len, modules))
+    lines = [f"  {name:{width}}  {summary}" for name, (_, summary) in modules.items()]
+    parser.epilog = "\n".join([f"{noun} is one of these, with --help each says more:", *lines])
+    names = parser.add_subparsers(dest="name", metavar=noun, required=True, help="what to run, see below")
     parsers = {}
-    for name, module in modules.items():
-        parsers[name] = names.add_parser(name)
+    for name, (module, summary) in modules.items():
+        parsers[name] = names.add_parser(name, description=summary)
         add_arguments(parsers[name], name)
         parsers[name].set_defaults(module=module)
     return parsers

@@ -8,12 +8,14 @@ import pytest
 from sim_bridge import bench, cli
 from sim_bridge.bench import library_rows, system_rows
 from sim_bridge.bench.comparison import compare
-from sim_bridge.bench.growth import exponent, growth_tables
+from sim_bridge.bench.growth import exponent, growth_tables, in_words
 from sim_bridge.bench.measuring import (
     QUICK,
     Cores,
     Effort,
     Row,
+    Wanted,
+    at_most,
     durations,
     measure_once,
     on_cores,
@@ -27,7 +29,7 @@ def instant(_cores):
 
 
 def options(**changes):
-    given = {"json": None, "only": None, "compare": None, "fail_above": None, "quick": True}
+    given = {"json": None, "only": None, "compare": None, "fail_above": None, "check": False, "quick": True}
     return argparse.Namespace(**given | changes)
 
 
@@ -157,10 +159,89 @@ def test_growth_is_fitted_and_missing_rows_leave_the_table_out():
         for n in library_rows.DOF
         for b in library_rows.BATCHES
     ]
-    table = growth_tables(rows)
-    assert table.count("1.50") == len(library_rows.DOF)
-    assert table.splitlines()[-1].count("1.00") == len(library_rows.BATCHES)
+    *table, powers, _ = growth_tables(rows).splitlines()
+    assert "\n".join(table).count("1.50") == len(library_rows.DOF)
+    assert powers.count("1.00") == len(library_rows.BATCHES)
     assert growth_tables(rows[1:]) == ""
+
+
+@pytest.mark.parametrize(
+    ("exponents", "words"),
+    [
+        ([0.9, 1.1], "about linearly (exponents 0.90 to 1.10)"),
+        ([1.0], "about linearly (exponent 1.00)"),
+        ([0.3, 0.5], "more slowly than linearly (exponents 0.30 to 0.50)"),
+        ([0.9, 1.3], "FASTER than linearly (exponents 0.90 to 1.30)"),
+    ],
+)
+def test_growth_in_words(exponents, words):
+    assert in_words(exponents) == words
+
+
+def test_the_sentence_below_a_table_is_about_its_exponents():
+    rows = [
+        row_entries(f"synthesis_b{b}_n{n}_via4_k50", 1e-3 * n**0.5 * b**2)
+        for n in library_rows.DOF
+        for b in library_rows.BATCHES
+    ] + [
+        row_entries(f"{label}_d{d}_m{library_rows.POPULATION}", d**power)
+        for label, power in (("sep_cma", 1.0), ("cma", 2.0))
+        for d in library_rows.DIMENSIONS
+    ]
+    words = [text for text in growth_tables(rows).splitlines() if "grows" in text]
+    assert words == [
+        "cost grows with the joints more slowly than linearly (exponent 0.50), "
+        "with the candidates FASTER than linearly (exponent 2.00)",
+        "sep-cma grows about linearly (exponent 1.00), cma grows FASTER than linearly (exponent 2.00)",
+    ]
+
+
+def test_the_figures_wanted():
+    wanted = {row.name: (row.wanted.entry, row.wanted.bound) for row in bench.ROWS if row.wanted is not None}
+    assert wanted == {
+        "basis_n7_via4_k50": ("p50_ms", 0.3),
+        "evaluate_n7_k1000": ("p50_ms", 0.3),
+        "synthesis_b100_n7_via4_k50": ("p50_ms", 0.4),
+        "vpsto_iteration_b64_n7_box": ("p50_ms", 2.0),
+        "posture_checks": ("checks_per_s", 1e6),
+        "solve_clutter_2d": ("p50_ms", 100.0),
+        "mpc_step_push_box": ("p99_ms", 16.0),
+        "driver": ("real_time_factor", 20.0),
+    }
+    more_is_better = [row.name for row in bench.ROWS if row.wanted and row.wanted.at_least]
+    assert more_is_better == ["posture_checks", "driver"]
+
+
+@pytest.mark.parametrize(("milliseconds", "reached"), [(10.0, True), (200.0, False)])
+def test_a_wanted_figure_is_judged_in_its_own_direction(milliseconds, reached):
+    wanted = at_most(100.0)
+    faster = Wanted("real_time_factor", 10.0, ">= 10 x real time", at_least=True)
+    for figure in (wanted, faster):
+        row = Row("a", instant, derived=system_rows.real_time_factor, wanted=figure)
+        entries = statistics(row, 1, [[1e-3 * milliseconds] * 2])
+        assert (entries["wanted"], entries["reached"]) == (figure.text, reached)
+        assert f"{figure.text}: {'yes' if reached else 'NO'}" in bench.line(entries)
+    assert wanted.text == "p50 <= 100 ms"
+    assert "wanted" not in statistics(row, 2, [[1.0, 1.0]]), "figures are those of one core"
+
+
+@pytest.mark.parametrize(
+    ("bound", "arguments", "status"), [(1.0, [], 0), (1.0, ["--check"], 1), (3.0, ["--check"], 0)]
+)
+def test_wanted_figures_decide_only_when_asked(monkeypatch, capsys, bound, arguments, status):
+    row = Row("only", lambda cores: lambda: [0.002], own_times=True, wanted=at_most(bound))
+    monkeypatch.setattr(bench, "ROWS", (row, Row("free", instant)))
+    assert cli.main(["bench", "--quick", *arguments]) == status
+    printed = capsys.readouterr().out
+    assert f"p50 <= {bound:g} ms: {'yes' if bound > 2.0 else 'NO'}" in printed
+    assert ("verdict: FAILED: not reached: only (p50 <= 1 ms)" in printed) == (status == 1)
+    assert ("verdict: passed: 1 figures reached" in printed) == (arguments != [] and status == 0)
+
+
+def test_a_check_without_anything_to_check_is_refused(monkeypatch):
+    monkeypatch.setattr(bench, "measure_all", None)
+    with pytest.raises(ConfigurationError, match="no figure is wanted"):
+        bench.run(options(only="evaluate_state", check=True))
 
 
 def verdicts(old, new):

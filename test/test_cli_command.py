@@ -24,6 +24,16 @@ def test_help_shows_examples(capsys):
         assert example in text.out
 
 
+def test_every_experiment_is_listed_with_a_line_about_it(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, text = outcome(capsys, "experiment", "--help")
+    assert code == 0
+    lines = text.out.partition("EXPERIMENT is one of these")[2].splitlines()[1:]
+    listed = dict(line.split(maxsplit=1) for line in lines)
+    assert max(map(len, lines)) <= 80
+    assert listed == {name: choice.summary for name, choice in cli.EXPERIMENTS.items()}
+
+
 def test_version(capsys):
     assert outcome(capsys, "--version")[1].out.strip() == f"vpsto {__version__}"
 

@@ -82,7 +82,8 @@ def modules_with_kernels():
 
 def test_every_kernel_is_cached_like_that():
     modules = [importlib.import_module(name) for name in modules_with_kernels()]
-    kernels = {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
+    values = [value for module in modules for value in vars(module).values()]
+    kernels = {value for value in values if isinstance(value, Dispatcher)}
     assert len(kernels) > 30
     assert {kernel.__qualname__ for kernel in kernels if not kernel._cache._impl.locator.noticing} == set()
 

@@ -14,6 +14,7 @@ from sim_bridge.bench import library_rows, system_rows
 from sim_bridge.bench.comparison import compare, comparison_table, read_rows
 from sim_bridge.bench.growth import growth_tables
 from sim_bridge.bench.measuring import QUICK, Effort, Row, measure_once, statistics, usable_cores
+from sim_bridge.experiments.runs import print_verdict
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 ROWS: tuple[Row, ...] = library_rows.ROWS + system_rows.ROWS
@@ -24,15 +25,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     Args:
         arguments: json (file or None), only (part of a name or None), compare (file or None), fail_above
-            (ratio or None), quick (bool).
+            (ratio or None), check (bool), quick (bool).
 
     Returns:
-        1 when a row takes more than `fail_above` times as long as in the file to compare with, beyond noise;
-        else 0.
+        1 when a row takes more than `fail_above` times as long as in the file to compare with, beyond noise,
+        or when `check` is asked for and a row does not reach the figure wanted of it; else 0. Without `check`
+        such figures are only shown: machines differ.
 
     Raises:
         InvalidInputError: when no row has such a name.
-        ConfigurationError: when a file cannot be read, has no rows, or cannot be written.
+        ConfigurationError: when a file cannot be read, has no rows, or cannot be written, or when there is
+            nothing to check.
     """
     rows = [row for row in ROWS if not arguments.only or arguments.only in row.name]
     if not rows:
@@ -40,6 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidInputError(f"no row is called {arguments.only!r}; there are {names}")
     if arguments.fail_above is not None and not arguments.compare:
         raise ConfigurationError("--fail-above needs --compare FILE")
+    if arguments.check and not any(row.wanted for row in rows):
+        raise ConfigurationError("--check: no figure is wanted of these rows")
     old = read_rows(arguments.compare) if arguments.compare else None
     if arguments.json and not pathlib.Path(arguments.json).absolute().parent.is_dir():
         raise ConfigurationError(f"--json {arguments.json}: there is no such folder")
@@ -49,7 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     growth = growth_tables(measured)
     if growth:
         print(f"\n{growth}", end="")
-    return 0 if old is None else report_changes(old, measured, arguments.fail_above)
+    changed = 0 if old is None else report_changes(old, measured, arguments.fail_above)
+    return max(changed, report_wanted(measured) if arguments.check else 0)
 
 
 def measure_all(rows: Sequence[Row], effort: Effort) -> list[dict[str, Any]]:
@@ -60,7 +66,8 @@ def measure_all(rows: Sequence[Row], effort: Effort) -> list[dict[str, Any]]:
     places = [(row, cores) for row in rows for cores in counts]
     passes: dict[tuple[str, int], list[list[float]]] = {(row.name, cores): [] for row, cores in places}
     results = []
-    print(f"{'name':34s} {'cores':>5s} {'p50 [ms]':>10s} {'p99 [ms]':>10s} {'max [ms]':>10s}", flush=True)
+    times = " ".join(f"{title:>10s}" for title in ("p50 [ms]", "p99 [ms]", "max [ms]"))
+    print(f"{'name':34s} {'cores':>5s} {times}   wanted", flush=True)
     with tqdm(total=effort.passes * len(places), disable=None, leave=False) as bar:
         for number in range(effort.passes):
             for row, cores in places:
@@ -76,10 +83,19 @@ def measure_all(rows: Sequence[Row], effort: Effort) -> list[dict[str, Any]]:
 def line(row: dict[str, Any]) -> str:
     """One row of the printed table."""
     times = " ".join(f"{row[key]:10.4f}" for key in ("p50_ms", "p99_ms", "max_ms"))
-    extra = f"   {row['real_time_factor']:.1f} x real time" if "real_time_factor" in row else ""
+    wanted = f"{row['wanted']}: {'yes' if row['reached'] else 'NO'}" if "wanted" in row else ""
+    extra = f"{row['real_time_factor']:.1f} x real time" if "real_time_factor" in row else ""
     if "checks_per_s" in row:
-        extra = f"   {row['checks_per_s'] / 1e6:.2f} million checks per second"
-    return f"{row['name']:34s} {row['cores']:5d} {times}{extra}"
+        extra = f"{row['checks_per_s'] / 1e6:.2f} million checks per second"
+    return f"{row['name']:34s} {row['cores']:5d} {times}   {wanted:26s} {extra}".rstrip()
+
+
+def report_wanted(measured: Sequence[dict[str, Any]]) -> int:
+    """Print the verdict on the figures wanted; 1 when one is not reached."""
+    judged = [row for row in measured if "wanted" in row]
+    short = [f"{row['name']} ({row['wanted']})" for row in judged if not row["reached"]]
+    found = f"not reached: {', '.join(short)}" if short else f"{len(judged)} figures reached"
+    return print_verdict(not short, found)
 
 
 def report_changes(

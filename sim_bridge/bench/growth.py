@@ -11,13 +11,16 @@ from sim_bridge.bench.library_rows import BATCHES, DIMENSIONS, DOF, POPULATION
 from sim_bridge.experiments.runs import markdown_table
 
 Entries = dict[str, Any]
+TOLERANCE = 0.15
+"""Exponents this near to 1 are called linear growth."""
 
 
 def growth_tables(rows: Sequence[Entries]) -> str:
     """Tables of the rows measured on one core, empty if the rows they need are missing.
 
     The exponent p is that of a least-squares fit of time ~ size^p on logarithmic scales: 1 is linear growth,
-    less means that a part of the time does not depend on the size.
+    less means that a part of the time does not depend on the size. A sentence below each table says what
+    that means.
     """
     single = [row for row in rows if row["cores"] == 1]
     synthesis = _synthesis({row["name"]: row["p50_ms"] for row in single})
@@ -31,31 +34,44 @@ def exponent(sizes: Sequence[float], times: Sequence[float]) -> float:
     return float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
 
 
+def in_words(exponents: Sequence[float]) -> str:
+    """What exponents of growth mean: compared with linear growth, and by how much."""
+    low, high = min(exponents), max(exponents)
+    figures = f"exponent {low:.2f}" if f"{low:.2f}" == f"{high:.2f}" else f"exponents {low:.2f} to {high:.2f}"
+    if high > 1.0 + TOLERANCE:
+        return f"FASTER than linearly ({figures})"
+    return f"{'about linearly' if high >= 1.0 - TOLERANCE else 'more slowly than linearly'} ({figures})"
+
+
 def _synthesis(times: dict[str, float]) -> str:
     names = {(n, b): f"synthesis_b{b}_n{n}_via4_k50" for n in DOF for b in BATCHES}
     if not all(name in times for name in names.values()):
         return ""
     table = np.array([[times[names[n, b]] for b in BATCHES] for n in DOF])
     rows = []
-    for n, row in zip(DOF, table, strict=True):
+    candidates = [exponent(BATCHES, row) for row in table]
+    joints = [exponent(DOF, column) for column in table.T]
+    for n, row, power in zip(DOF, table, candidates, strict=True):
         cells = [
             f"{time:.3f} ms ({1e6 * time / (n * b):.0f} ns)" for time, b in zip(row, BATCHES, strict=True)
         ]
-        rows.append([f"{n}", *cells, f"{exponent(BATCHES, row):.2f}"])
-    powers = [f"{exponent(DOF, column):.2f}" for column in table.T]
-    rows.append(["exponent in joints", *powers, ""])
+        rows.append([f"{n}", *cells, f"{power:.2f}"])
+    rows.append(["exponent in joints", *(f"{power:.2f}" for power in joints), ""])
     header = ["joints", *(f"{b} candidates" for b in BATCHES), "exponent in candidates"]
-    return f"batch synthesis, in brackets per candidate and joint\n{markdown_table(header, rows)}"
+    words = f"cost grows with the joints {in_words(joints)}, with the candidates {in_words(candidates)}"
+    return f"batch synthesis, in brackets per candidate and joint\n{markdown_table(header, rows)}{words}\n"
 
 
 def _search(times: dict[str, float]) -> str:
-    rows = []
+    rows, words = [], []
     for label in ("sep_cma", "cma"):
         names = [f"{label}_d{d}_m{POPULATION}" for d in DIMENSIONS]
         if not all(name in times for name in names):
             return ""
         row = [times[name] for name in names]
         cells = [f"{time:.3f} ms" for time in row]
-        rows.append([label.replace("_", "-"), *cells, f"{exponent(DIMENSIONS, row):.2f}"])
+        name, power = label.replace("_", "-"), exponent(DIMENSIONS, row)
+        rows.append([name, *cells, f"{power:.2f}"])
+        words.append(f"{name} grows {in_words([power])}")
     header = ["search", *(f"{d} variables" for d in DIMENSIONS), "exponent"]
-    return f"one iteration of the search, mean\n{markdown_table(header, rows)}"
+    return f"one iteration of the search, mean\n{markdown_table(header, rows)}{', '.join(words)}\n"

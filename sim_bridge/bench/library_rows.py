@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from sim_bridge.bench.measuring import Action, Cores, Row
+from sim_bridge.bench.measuring import Action, Cores, Row, Wanted, at_most
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
@@ -190,19 +190,20 @@ def checks_per_second(seconds: float) -> dict[str, float]:
     return {"checks_per_s": POSTURES / seconds}
 
 
+MILLION_CHECKS = Wanted("checks_per_s", 1e6, ">= 1 million checks/s", at_least=True)
 ROWS = (
-    Row("basis_n7_via4_k50", basis),
+    Row("basis_n7_via4_k50", basis, wanted=at_most(0.3)),
     Row("basis_n7_via4_cached", cached_basis),
     *(Row(f"synthesis_b{b}_n{n}_via4_k50", partial(synthesis, n, b)) for n in DOF for b in BATCHES),
-    Row("synthesis_b100_n7_via4_k50", arm_synthesis),
-    Row("evaluate_n7_k1000", partial(evaluation, 1)),
+    Row("synthesis_b100_n7_via4_k50", arm_synthesis, wanted=at_most(0.4)),
+    Row("evaluate_n7_k1000", partial(evaluation, 1), wanted=at_most(0.3)),
     Row("evaluate_state_n7_k1000", partial(evaluation, 3)),
     *(Row(f"sep_cma_d{d}_m{POPULATION}", partial(search_step, "sep-cma", d)) for d in DIMENSIONS),
     *(Row(f"cma_d{d}_m{POPULATION}", partial(search_step, "cma", d)) for d in DIMENSIONS),
-    Row("vpsto_iteration_b64_n7_box", vpsto_iteration),
-    Row("posture_checks", posture_checks, derived=checks_per_second),
+    Row("vpsto_iteration_b64_n7_box", vpsto_iteration, wanted=at_most(2.0)),
+    Row("posture_checks", posture_checks, derived=checks_per_second, wanted=MILLION_CHECKS),
     Row("arm_paths_b64", arm_paths),
     Row("planar_paths_b64", planar_paths),
-    Row("solve_clutter_2d", clutter_solve),
+    Row("solve_clutter_2d", clutter_solve, wanted=at_most(100.0)),
     Row("key_timing_n7_via4", key_timing),
 )

@@ -53,6 +53,28 @@ class Cores:
 
 
 @dataclasses.dataclass(frozen=True)
+class Wanted:
+    """A figure that one core of a machine of today should reach.
+
+    Attributes:
+        entry: of the row, for example ``p50_ms``.
+        bound: what it is compared with.
+        text: the same in words, with the unit.
+        at_least: more is better; otherwise less is.
+    """
+
+    entry: str
+    bound: float
+    text: str
+    at_least: bool = False
+
+    def reached(self, entries: dict[str, Any]) -> bool:
+        """Whether the entries of a row are as good."""
+        value = entries[self.entry]
+        return bool(value >= self.bound if self.at_least else value <= self.bound)
+
+
+@dataclasses.dataclass(frozen=True)
 class Row:
     """One row of the table.
 
@@ -63,6 +85,7 @@ class Row:
         calls: per pass; by default as many as fill the time a row may take.
         own_times: the call returns durations [s] instead of being timed as a whole.
         derived: further entries of the row, from the median duration [s].
+        wanted: the figure that it should reach on one core, if there is one.
     """
 
     name: str
@@ -70,6 +93,12 @@ class Row:
     calls: int | None = None
     own_times: bool = False
     derived: Callable[[float], dict[str, float]] | None = None
+    wanted: Wanted | None = None
+
+
+def at_most(milliseconds: float, entry: str = "p50_ms") -> Wanted:
+    """A duration that should not be exceeded."""
+    return Wanted(entry, milliseconds, f"{entry.removesuffix('_ms')} <= {milliseconds:g} ms")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +149,8 @@ def statistics(row: Row, cores: int, passes: Sequence[Sequence[float]]) -> dict[
     `noise` is the scatter of the median over parts of the measurement, relative to the median: the median
     absolute deviation, scaled to the standard deviation of a normal distribution. Like the median itself, it
     does not mind a few parts during which other processes had the core. `mean_ms` leaves the slowest percent
-    out for the same reason.
+    out for the same reason. Rows on one core say what is `wanted` of them, if anything is, and whether it is
+    `reached`.
 
     Args:
         row: what was measured.
@@ -142,7 +172,10 @@ def statistics(row: Row, cores: int, passes: Sequence[Sequence[float]]) -> dict[
         "mean_ms": 1e3 * float(mean),
         "noise": float(scatter / p50),
     }
-    return entries | (row.derived(float(p50)) if row.derived else {})
+    entries |= row.derived(float(p50)) if row.derived else {}
+    if row.wanted is not None and cores == 1:
+        entries |= {"wanted": row.wanted.text, "reached": row.wanted.reached(entries)}
+    return entries
 
 
 def usable_cores() -> int:

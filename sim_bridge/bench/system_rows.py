@@ -9,7 +9,7 @@ import threading
 
 import numpy as np
 
-from sim_bridge.bench.measuring import Action, Cores, Row
+from sim_bridge.bench.measuring import Action, Cores, Row, Wanted, at_most
 from sim_bridge.experiments.pushing.loop import push_box_loop
 from sim_bridge.simulation import Simulation
 from vpsto_ros.planning.goal import PlanarGoal
@@ -82,9 +82,10 @@ def first_plan(_cores: Cores) -> Action:
     return lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
+REAL_TIME = Wanted("real_time_factor", 20.0, ">= 20 x real time", at_least=True)
 ROWS: tuple[Row, ...] = (
-    Row("mpc_step_push_box", mpc_step, calls=4, own_times=True),
-    Row("driver", driver, calls=4, derived=real_time_factor),
+    Row("mpc_step_push_box", mpc_step, calls=4, own_times=True, wanted=at_most(16.0, "p99_ms")),
+    Row("driver", driver, calls=4, derived=real_time_factor, wanted=REAL_TIME),
     Row("first_plan", first_plan, calls=1),
 )
 if importlib.util.find_spec("rclpy"):
