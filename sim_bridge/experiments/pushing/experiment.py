@@ -19,6 +19,7 @@ from sim_bridge.experiments.runs import (
     success_interval,
     write_summary,
 )
+from sim_bridge.warm_up import push_a_box
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import ConfigurationError
@@ -107,7 +108,8 @@ class PushingExperiment:
         trials = [self.random_trial(seed) for seed in range(arguments.seed, arguments.seed + arguments.runs)]
         variants = self._chosen(arguments.only)
         tasks = [(variant, trial) for variant in variants for trial in trials]
-        runs = run_trials(run_variant, tasks, Execution.from_arguments(arguments), self.name)
+        execution = Execution.from_arguments(arguments)
+        runs = run_trials(run_variant, tasks, execution, self.name, warm_up=push_a_box)
         results = {
             variant.name: runs[k * len(trials) : (k + 1) * len(trials)] for k, variant in enumerate(variants)
         }
