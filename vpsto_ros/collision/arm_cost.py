@@ -38,7 +38,7 @@ class ArmPathCost:
         self,
         checker: ArmCollision,
         *,
-        weight: float = 100.0,
+        weight: float = 60.0,
         proof_margin: float = 0.0,
         depth_scale: float = 0.05,
         tolerance: float = TOLERANCE,

@@ -1,6 +1,12 @@
-"""Closed loop among obstacles that move or appear: the motion is planned anew twenty times a second."""
+"""Closed loop among obstacles that move or appear: the motion is planned anew twenty times a second.
+
+The arm follows what it is told perfectly, with the latency of one period: what is decided from a measurement
+takes effect one period later. The motion that was executed is judged as a whole, at every instant.
+"""
 
 import dataclasses
+import itertools
+import math
 import time
 
 import numpy as np
@@ -11,6 +17,7 @@ from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.shapes import Capsule, Shape, Sphere
 from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig, JointSpacePlan
+from vpsto_ros.planning.stitching import extended, remainder
 from vpsto_ros.robot.kinematics import forward_kinematics_batch
 from vpsto_ros.trajectory import Limits, Trajectory
 
@@ -22,7 +29,12 @@ _RADIUS = 0.07  # of the intruder [m]
 _ROOM = 0.12  # between the intruder and the arm in the beginning, and its goal posture [m]
 _REACTION = 0.3  # time in which the motion stays that far away [s]
 _FORESIGHT = 0.5  # how far ahead the intruder's straight motion is kept clear [s]
-_CHECKS = 11  # postures checked per period, 5 ms apart
+_SLICE = 0.005  # in which the intruder counts as all that it sweeps when a run is judged [s]
+_TOLERANCE = 1e-4  # of the proofs then [m]
+AT_GOAL, AT_REST = 1e-3, 1e-6  # of every joint at the end [rad, rad/s]
+LARGEST_STEP = 1e-9  # between what two plans say about the same instant [rad, rad/s]
+CONTROLLER = JointSpaceMpcConfig(spread=0.4)
+"""Without a deadline: the search has its iterations, so that a run is the same on every machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,27 +57,33 @@ class Intruder:
 
     def ahead(self, time: float) -> Capsule:
         """What it sweeps in the near future."""
-        a = self.centre + (time - self.time) * self.velocity
-        return Capsule(a, a + _FORESIGHT * self.velocity, _RADIUS, "intruder")
+        return self.swept(time, time + _FORESIGHT)
+
+    def swept(self, begin: float, end: float) -> Capsule:
+        """What it sweeps from one time to another."""
+        a, b = self.at(begin).centre, self.at(end).centre
+        return Capsule(a, b, _RADIUS, "intruder")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class OnlineRun:
     """What happened.
 
     Attributes:
+        motion: everything that was executed, stitched together.
         reached: whether the arm came to rest at the goal in time.
-        collisions: postures in collision of those checked every 5 ms, with the ball where it is then.
-        duration: until the goal [s].
-        replanning_ms: processor times of the planning steps.
-        replanned: whether the intruder was in the way of a motion that was being executed.
+        contact: what could not be proven free of collision, and when, in words; None if all of it was.
+        broken: limits exceeded at any instant, and steps in position or velocity, in words.
+        blocked: whether the intruder was in the way of a motion that was being executed.
+        step_seconds: processor time of every planning step [s].
     """
 
+    motion: Trajectory
     reached: bool
-    collisions: int
-    duration: float
-    replanning_ms: list[float]
-    replanned: bool
+    contact: str | None
+    broken: list[str]
+    blocked: bool
+    step_seconds: NDArray[np.float64]
 
 
 def random_intruder(
@@ -116,35 +134,41 @@ def run_online(
         intruder: instead of a random one, which shows up after 10 to 40 % of the first plan.
     """
     rng = np.random.default_rng([seed, 1])
-    mpc = JointSpaceMpc(limits, JointSpaceMpcConfig(spread=0.4), np.random.default_rng(seed))
+    mpc = JointSpaceMpc(limits, CONTROLLER, np.random.default_rng(seed))
     mpc.begin(task.start, 0.0)
     mpc.accept(JointSpacePlan(first, "explore", "explore", True, first.duration))
     cell, blocked = ArmCollision(None, task.obstacles), False
     show = first.duration * rng.uniform(0.1, 0.4) if intruder is None else intruder.time
-    now, collisions, times = 0.0, 0, []
-    while now < TIMEOUT:
+    pieces: list[Trajectory] = []
+    seconds = []
+    for k in range(round(TIMEOUT / PERIOD)):
+        now, after = k * PERIOD, (k + 1) * PERIOD
         if now >= show and intruder is None:
             intruder = random_intruder(task, mpc.reference, now, rng, moving=moving)
             if intruder is None:
                 return None
-        seen = _seen(task.obstacles, intruder, now, now + PERIOD)
         begin = time.thread_time()
-        checker = cell.with_obstacles(seen)
-        plan = mpc.step(
-            now + PERIOD, task.goal, (ArmPathCost(checker.with_margin(MARGIN), proof_margin=0.5 * MARGIN),),
-            tolerated=(ArmPathCost(checker.with_margin(KEPT_MARGIN)),),
-            deadline=begin + 0.8 * PERIOD, clock=time.thread_time,
-        )  # fmt: skip
-        times.append(1e3 * (time.thread_time() - begin))
+        checker = cell.with_obstacles(_seen(task.obstacles, intruder, now, after))
+        plan = _planned(mpc, checker, task, after)
+        seconds.append(time.thread_time() - begin)
         if now >= show:
-            blocked = blocked or not checker.free_along(mpc.reference.clipped(now, TIMEOUT + 1.0)).free
-        collisions += _collisions(cell, task.obstacles, intruder, mpc.reference, now)
+            blocked = blocked or not checker.free_along(remainder(mpc.reference, now)).free
+        pieces.append(_period(mpc.reference, now, after))
         mpc.accept(plan)
-        now += PERIOD
         if plan.mode == "hold" and now > show:
             break
-    at_goal = bool(np.abs(mpc.reference(now) - task.goal).max() < 1e-3)
-    return OnlineRun(at_goal, collisions, now, times, blocked)
+    motion = stitched(pieces)
+    contact = first_contact(motion, cell, intruder)
+    return OnlineRun(
+        motion, at_rest_at(motion, task.goal), contact, broken(motion, limits), blocked, np.array(seconds)
+    )
+
+
+def _planned(mpc: JointSpaceMpc, checker: ArmCollision, task: ReachTask, takeover: float) -> JointSpacePlan:
+    """New plans keep a margin; the present one may come closer before it is given up."""
+    careful = ArmPathCost(checker.with_margin(MARGIN), proof_margin=0.5 * MARGIN)
+    just = ArmPathCost(checker.with_margin(KEPT_MARGIN))
+    return mpc.step(takeover, task.goal, (careful,), tolerated=(just,))
 
 
 def _seen(
@@ -156,16 +180,48 @@ def _seen(
     return (*obstacles, intruder.ahead(then))
 
 
-def _collisions(
-    cell: ArmCollision,
-    obstacles: tuple[Shape, ...],
-    intruder: Intruder | None,
-    motion: Trajectory,
-    now: float,
-) -> int:
-    """Postures in collision during one period of the executed motion."""
-    hits = 0
-    for time_ in now + np.linspace(0.0, PERIOD, _CHECKS)[1:]:
-        there = (intruder.at(time_),) if intruder is not None and time_ >= intruder.time else ()
-        hits += bool(cell.with_obstacles((*obstacles, *there)).in_collision(motion(time_)))
-    return hits
+def _period(motion: Trajectory, begin: float, end: float) -> Trajectory:
+    """What is executed in one period."""
+    rest = extended(remainder(motion, begin), end)
+    return rest.clipped(rest.start_time, end)
+
+
+def stitched(pieces: list[Trajectory]) -> Trajectory:
+    """One motion from pieces that follow each other in time, whatever their steps."""
+    times = np.concatenate([[pieces[0].start_time], *(piece.times[1:] for piece in pieces)])
+    return Trajectory(times, np.concatenate([piece.coefficients for piece in pieces]))
+
+
+def at_rest_at(motion: Trajectory, goal: NDArray) -> bool:
+    """Whether a motion ends at a posture (7,) [rad], without velocity."""
+    position, velocity, _ = motion.state(motion.end_time)
+    return bool(np.abs(position - goal).max() < AT_GOAL and np.abs(velocity).max() < AT_REST)
+
+
+def broken(motion: Trajectory, limits: Limits) -> list[str]:
+    """Limits that a motion exceeds at any instant, and its steps in position and velocity, in words."""
+    position, velocity = (float(jump.max(initial=0.0)) for jump in motion.jumps())
+    steps = [f"steps of {position:.3g} rad and {velocity:.3g} rad/s"]
+    return motion.violations(limits) + (steps if max(position, velocity) > LARGEST_STEP else [])
+
+
+def first_contact(motion: Trajectory, cell: ArmCollision, intruder: Intruder | None) -> str | None:
+    """What a motion collides with first, in words; None if it is proven not to, at every instant.
+
+    The obstacles that stand still at once; the intruder slice by slice of the time, as all that it sweeps in
+    a slice.
+    """
+    found = cell.free_along(motion, tolerance=_TOLERANCE)
+    if not found.free:
+        return f"{', '.join(map(str, found.contacts))} at {found.time:.3f} s"
+    if intruder is None or intruder.time >= motion.end_time:
+        return None
+    count = math.ceil((motion.end_time - intruder.time) / _SLICE)
+    times = np.linspace(max(intruder.time, motion.start_time), motion.end_time, count + 1)
+    for begin, end in itertools.pairwise(times):
+        found = cell.with_obstacles([intruder.swept(begin, end)]).free_along(
+            motion.clipped(begin, end), tolerance=_TOLERANCE
+        )
+        if not found.free:
+            return f"{', '.join(map(str, found.contacts))} at {found.time:.3f} s"
+    return None
