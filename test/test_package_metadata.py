@@ -17,6 +17,12 @@ PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 HEAVY = {
     "rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags", "joblib", "dask", "distributed",
 }  # fmt: skip
+ROOMS = (
+    "trajectory", "contact", "robot", "collision", "priors", "estimation", "optimization", "planning",
+    "nodes",
+)  # fmt: skip
+"""A room may import those before it, and the modules that belong to no room."""
+SHARED = {"configuration", "exceptions", "kernel_cache", "sources"}
 SCRIPTS = dict(re.findall(r'"(\w+) = ([\w.]+:\w+)"', SETUP))
 
 
@@ -48,6 +54,55 @@ def test_every_entry_point_exists(target):
     assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
+def imported_names(file):
+    """Dotted names of what a file imports anywhere in it; for `from a import b`, a.b as b may be a module."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: a relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def rooms_imported(file):
+    """Names directly below vpsto_ros that a file imports."""
+    return {name.split(".")[1] for name in imported_names(file) if name.startswith("vpsto_ros.")}
+
+
+def test_the_rooms_are_all_that_there_is():
+    folders = {file.parent.name for file in ROOT.glob("vpsto_ros/*/__init__.py")}
+    assert folders == set(ROOMS)
+    assert {file.stem for file in ROOT.glob("vpsto_ros/*.py")} == SHARED | {"__init__"}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_only_the_rooms_before_it(room):
+    allowed = SHARED | {"__version__", room} | set(ROOMS[: ROOMS.index(room)])
+    files = list((ROOT / "vpsto_ros" / room).rglob("*.py"))
+    wrong = {str(file.relative_to(ROOT)): rooms_imported(file) - allowed for file in files}
+    assert files and not {file: names for file, names in wrong.items() if names}
+
+
+def test_what_belongs_to_no_room_imports_no_room():
+    for name in SHARED | {"__init__"}:
+        assert rooms_imported(ROOT / "vpsto_ros" / f"{name}.py") <= SHARED | {"__version__"}
+
+
+def test_the_library_never_imports_the_simulation():
+    files = list(ROOT.glob("vpsto_ros/**/*.py"))
+    tops = {str(file): {name.split(".")[0] for name in imported_names(file)} for file in files}
+    assert not [file for file, names in tops.items() if "sim_bridge" in names]
+
+
+def test_imports_are_found_wherever_they_are(tmp_path):
+    (tmp_path / "a.py").write_text(
+        "import vpsto_ros.robot.kinematics as k\nfrom vpsto_ros import nodes\n"
+        "def f():\n    from sim_bridge.cli import main\n"
+    )
+    assert rooms_imported(tmp_path / "a.py") == {"robot", "nodes"}
+    assert "sim_bridge.cli.main" in set(imported_names(tmp_path / "a.py"))
+
+
 def test_every_message_package_that_is_imported_is_declared():
     declared = {element.text for element in PACKAGE.findall("exec_depend")}
     imported = set()
@@ -56,10 +111,7 @@ def test_every_message_package_that_is_imported_is_declared():
         *ROOT.glob("sim_bridge/**/*.py"),
         *ROOT.glob("launch/*.py"),
     ]:
-        for node in ast.walk(ast.parse(file.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and node.level == 0 else []
-            imported |= {name.split(".")[0] for name in names}
+        imported |= {name.split(".")[0] for name in imported_names(file)}
     ros = {
         name
         for name in imported
