@@ -5,6 +5,7 @@ are invalid.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from vpsto_ros.configuration import option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.terms import (
+    MOST_POINTS,
     CollisionCheck,
     Term,
     collision_cost,
@@ -47,7 +49,7 @@ class CostWeights:
     duration: float = option(1.0, "weight of the movement duration", unit="1/s", minimum=0.0)
     smoothness: float = option(0.001, "weight of the smoothness term", minimum=0.0)
     joint_limits: float = option(100.0, "weight of a joint limit exceeded", minimum=0.0)
-    collision: float = option(100.0, "weight of every evaluation point in collision", minimum=0.0)
+    collision: float = option(100.0, "weight of the time in collision", unit="1/s", minimum=0.0)
 
     def __post_init__(self) -> None:
         validate(self)
@@ -90,7 +92,11 @@ class JointSpaceProblem:
         start_velocity: shape (n,), zero by default.
         end_velocity: shape (n,), zero by default.
         collision: maps positions (B, K, n) to collisions (B, K) of bool; None for free space. It sees only
-            the evaluation points, so obstacles need a margin of half the distance between two of them.
+            points at most ``collision_step`` apart: give obstacles a margin of half of that. Terms from
+            :mod:`vpsto_ros.collision` need none, they are exact at every instant.
+        collision_step: largest distance between two of these points in any joint; by default as far apart as
+            ``samples`` points can be on the straight motion to the goal, or, where there is none, in the
+            range of the position limits.
         terms: further costs, each mapping a batch to cost (B,) and validity (B,); their weights are 1. A term
             may have a method ``explain(trajectory) -> list[str]`` that says in words what a trajectory
             collides with, and, if its obstacles move, ``static = False``.
@@ -118,6 +124,7 @@ class JointSpaceProblem:
     weights: CostWeights = dataclasses.field(default_factory=CostWeights)
     samples: int = 50
     check_ends: bool = True
+    collision_step: float | None = None
 
     def __post_init__(self) -> None:
         _check_kind("basis", self.basis, OptimalBasis, "an OptimalBasis, such as OptimalBasis.uniform(3)")
@@ -137,10 +144,24 @@ class JointSpaceProblem:
             if array.shape != (n,) or not np.isfinite(array).all():
                 raise InvalidInputError(f"{name} must be finite with shape ({n},), got {value!r}")
             object.__setattr__(self, name, array)
+        if self.collision is not None and self.collision_step is None:
+            object.__setattr__(self, "collision_step", self._default_step())
         for name in ("start", "goal") if self.check_ends else ():
             wrong = [] if getattr(self, name) is None else self._end_conflicts(name)
             if wrong:
                 raise InvalidInputError(f"{name} {_coordinates(getattr(self, name))}: {'; '.join(wrong)}")
+
+    def _default_step(self) -> float:
+        """See ``collision_step``; the slope of the straight motion is at most three times its chord."""
+        way = 0.0 if self.goal is None else 3.0 * float(np.abs(self.goal - self.start).max())
+        lower, upper = self.limits.position_range
+        way = way or float(np.min(upper - lower))
+        if not np.isfinite(way):
+            raise InvalidInputError(
+                "collision_step is needed: without a goal away from the start and without position limits "
+                "nothing tells how far apart evaluation points may be"
+            )
+        return way / (self.samples - 1)
 
     def _end_conflicts(self, name: str) -> list[str]:
         """Why no valid motion can start or end where this one does."""
@@ -220,7 +241,10 @@ class JointSpaceProblem:
             cost = cost + weights.smoothness * smoothness_cost(batch)
         constraints = [(weights.joint_limits, joint_limit_cost(batch, self.limits))]
         if self.collision is not None:
-            constraints.append((weights.collision, collision_cost(batch, self.collision)))
+            assert self.collision_step is not None
+            constraints.append(
+                (weights.collision, collision_cost(batch, self.collision, self.collision_step))
+            )
         constraints += [(1.0, term(batch)) for term in self.terms]
         for weight, (extra, holds) in constraints:
             cost = cost + weight * extra
@@ -231,8 +255,13 @@ class JointSpaceProblem:
         """The timed trajectory of one candidate (P, n).
 
         Raises:
+            InvalidInputError: there are no points, as in the result of a search that found nothing valid.
             InfeasibleError: a boundary velocity is beyond its limit.
         """
+        if points is None:
+            raise InvalidInputError(
+                "no points: the search found nothing valid; explain(result.best_any_points) says why"
+            )
         keys = self.key_positions(points[None])[0]
         return synthesize(
             self.basis, keys, self.start_velocity, self.end_velocity, self.limits, start_time=start_time
@@ -254,19 +283,28 @@ class JointSpaceProblem:
             return [str(error)]
         wrong = trajectory.violations(self.limits)
         if self.collision is not None:
-            hits = np.flatnonzero(in_collision(batch.position, self.collision)[0])
-            if hits.size:
-                time = float(batch.duration[0]) * hits[0] / (self.samples - 1)
-                wrong.append(
-                    f"in collision at {hits.size} of {self.samples} evaluation points, first at {time:.3f} s "
-                    f"in {_coordinates(batch.position[0, hits[0]])}"
-                )
+            wrong += self._explain_collision(batch, trajectory)
         for term in self.terms:
             cost, valid = term(batch)
             if not valid[0]:
                 name = getattr(term, "__name__", type(term).__name__)
                 wrong += _explained(term, trajectory) or [f"{name} is not satisfied (cost {cost[0]:.6g})"]
         return wrong
+
+    def _explain_collision(self, batch: TrajectoryBatch, trajectory: Trajectory) -> list[str]:
+        """How long the only candidate of a batch is in collision, and where first; empty if it is not."""
+        assert self.collision is not None and self.collision_step is not None
+        spent, free = collision_cost(batch, self.collision, self.collision_step)
+        if free[0]:
+            return []
+        count = max(self.samples, math.ceil(float(batch.largest_slope()[0]) / self.collision_step) + 1)
+        times = np.linspace(0.0, trajectory.duration, min(count, MOST_POINTS))
+        positions = trajectory(times)
+        hits = np.flatnonzero(in_collision(positions[None], self.collision)[0])
+        if not hits.size:
+            return [f"too long to be checked for collision every {self.collision_step:.3g}"]
+        where = _coordinates(positions[hits[0]])
+        return [f"in collision for {spent[0]:.3g} s, first at {times[hits[0]]:.3f} s in {where}"]
 
 
 def _check_kind(name: str, value: object, kind: type, expected: str) -> None:

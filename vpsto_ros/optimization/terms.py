@@ -49,21 +49,43 @@ def joint_limit_cost(batch: TrajectoryBatch, limits: Limits) -> tuple[np.ndarray
     return cost, cost == 0.0
 
 
-def collision_cost(batch: TrajectoryBatch, check: CollisionCheck) -> tuple[np.ndarray, np.ndarray]:
-    """Number of evaluation points in collision.
+MOST_POINTS = 5000
+"""Points of a motion that are looked at; one that is too long for them counts as in collision at a point."""
+
+
+def collision_cost(
+    batch: TrajectoryBatch, check: CollisionCheck, step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Time in collision [s], judged at points at most `step` apart in every degree of freedom.
+
+    Deviation: the thesis counts a fixed number of evaluation points. Then a search finds motions that take a
+    detour elsewhere, which leaves few points for the obstacle, and jump through it between two of them.
+    Here a longer motion has more points, so that an obstacle with a margin of half a step is never missed.
 
     Args:
         batch: trajectories.
         check: maps positions (B, K, n) to collisions (B, K) of bool.
+        step: largest distance between two points, in the unit of the joints, positive.
 
     Returns:
         Cost (B,) and validity (B,).
 
     Raises:
-        InvalidInputError: the check returned another shape.
+        InvalidInputError: the check returned another shape, or the step is not positive.
     """
-    count = in_collision(batch.position, check).sum(axis=1)
-    return count.astype(float), count == 0
+    if not (np.isfinite(step) and step > 0.0):
+        raise InvalidInputError(f"the step between evaluation points must be positive, got {step!r}")
+    share = in_collision(batch.position, check).mean(axis=1)
+    needed = np.ceil(batch.largest_slope() / step) + 1.0
+    longer = np.flatnonzero((needed > batch.position.shape[1]) & np.isfinite(batch.duration))
+    for rows in np.array_split(longer[np.argsort(needed[longer])], 1 + longer.size // 8):
+        if rows.size:
+            count = int(min(needed[rows].max(), MOST_POINTS))
+            positions = batch.positions_at(np.linspace(0.0, 1.0, count), rows)
+            share[rows] = in_collision(positions, check).mean(axis=1)
+    share[needed > MOST_POINTS] = np.maximum(share[needed > MOST_POINTS], 1.0 / MOST_POINTS)
+    finite = np.where(np.isfinite(batch.duration), batch.duration, 0.0)
+    return share * finite, share == 0.0
 
 
 def in_collision(positions: np.ndarray, check: CollisionCheck) -> np.ndarray:

@@ -94,7 +94,7 @@ class OptimalBasis:
         if s.ndim != 1 or not np.all((s >= 0.0) & (s <= 1.0)):
             raise InvalidInputError("phases to evaluate must lie in [0, 1]")
         segment, u = locate(self, s)
-        left, right, out, back = _hermite_weights(u, np.diff(self.knots)[segment], order)
+        left, right, out, back = hermite_weights(u, np.diff(self.knots)[segment], order)
         phi = out[:, None] * self.knot_slopes[segment] + back[:, None] * self.knot_slopes[segment + 1]
         row = np.arange(s.size)
         phi[row, segment] += left
@@ -147,7 +147,7 @@ def _knot_curvatures(knots: NDArray[np.float64], slopes: NDArray[np.float64]) ->
     return np.vstack([left, last])
 
 
-def _hermite_weights(u: NDArray, h: NDArray, order: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+def hermite_weights(u: NDArray, h: NDArray, order: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Weights of (q_i, q_i+1, q'_i, q'_i+1) in the order-th derivative of a cubic Hermite segment."""
     one = np.ones_like(u)
     if order == 0:

@@ -8,7 +8,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.trajectory.basis import OptimalBasis, locate
+from vpsto_ros.trajectory.basis import OptimalBasis, hermite_weights, locate
 from vpsto_ros.trajectory.kernels import MINIMUM_DURATION, durations_kernel, synthesis_kernel
 
 __all__ = ["MINIMUM_DURATION", "Limits", "TrajectoryBatch", "minimal_duration", "synthesize_batch"]
@@ -101,6 +101,22 @@ class TrajectoryBatch:
     key_positions: NDArray[np.float64]
     knots: NDArray[np.float64]
     knot_slopes: NDArray[np.float64]
+
+    def positions_at(self, phases: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions (R, K', n) of some rows (R,) at other phases (K',) in [0, 1]."""
+        segment = np.clip(np.searchsorted(self.knots, phases, side="right") - 1, 0, self.knots.size - 2)
+        h = np.diff(self.knots)[segment]
+        u = (phases - self.knots[segment]) / h
+        left, right, out, back = (weight[:, None] for weight in hermite_weights(u, h, 0))
+        keys, slopes = self.key_positions[rows], self.knot_slopes[rows]
+        position = left * keys[:, segment] + right * keys[:, segment + 1]
+        return position + out * slopes[:, segment] + back * slopes[:, segment + 1]
+
+    def largest_slope(self) -> NDArray[np.float64]:
+        """A bound (B,) on |q'(s)| of every degree of freedom, from the control points of the parabolas."""
+        chord = np.diff(self.key_positions, axis=1) / np.diff(self.knots)[:, None]
+        middle = 3.0 * chord - self.knot_slopes[:, :-1] - self.knot_slopes[:, 1:]
+        return np.maximum(np.abs(middle).max(axis=(1, 2)), np.abs(self.knot_slopes).max(axis=(1, 2)))
 
 
 def minimal_duration(

@@ -22,7 +22,7 @@ _JOIN_TOLERANCE = 1e-9
 _QUANTITIES = ("position", "velocity", "acceleration")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Piecewise polynomial of degree <= 5 in time for n degrees of freedom; immutable.
 
@@ -60,6 +60,11 @@ class Trajectory:
             raise InvalidInputError("times and coefficients must be finite")
         if not (times[1:] > times[:-1]).all():
             raise InvalidInputError("times must increase strictly")
+
+    def __repr__(self) -> str:
+        """In a line; the coefficients of an arm's motion fill a screen."""
+        span = f"{self.start_time:g} s to {self.end_time:g} s"
+        return f"Trajectory({self.dof} degrees of freedom, {span}, {self.times.size - 1} segments)"
 
     @classmethod
     def from_points(
