@@ -23,7 +23,7 @@ from vpsto_ros.contact.pushing import PushingModel, push_directions
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
-from vpsto_ros.planning.joint_space import JointSpaceMpcConfig
+from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch
 from vpsto_ros.trajectory.key_timing import time_key_positions

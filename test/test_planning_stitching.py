@@ -1,11 +1,14 @@
 """Motions joined and cut: what is left of one is that motion, and at rest nothing moves."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig, OnlineJointSpaceProblem
 from vpsto_ros.planning.stitching import as_batch, extended, remainder, resting
-from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize
+from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize, synthesize_batch
 
 LIMITS = Limits(np.array([0.5, 0.4, 0.6]), np.array([2.0, 1.5, 2.5]))
 
@@ -45,3 +48,25 @@ def test_an_extended_motion_rests_at_its_end():
     still = resting(keys[0], 2.0, 3.5)
     assert (still.start_time, still.end_time) == (2.0, 3.5)
     assert not still(np.linspace(2.0, 3.5, 9), 1).any()
+
+
+def test_a_running_motion_is_measured_like_a_candidate():
+    def slow(batch):
+        """Some constraint on the derivatives too."""
+        excess = np.maximum(np.abs(batch.velocity).max(axis=(1, 2)) - 0.4, 0.0)
+        return excess, excess == 0.0
+
+    basis, keys = OptimalBasis.uniform(3), np.random.default_rng(0).uniform(-0.5, 0.5, (5, 3))
+    velocity = np.array([0.2, -0.1, 0.3])
+    trajectory = synthesize(basis, keys, velocity, np.zeros(3), LIMITS, start_time=3.0)
+    one, other = as_batch(trajectory, 40), synthesize_batch(basis, keys, velocity, np.zeros(3), LIMITS, 40)
+    for field in dataclasses.fields(one):
+        expected = getattr(other, field.name)
+        np.testing.assert_allclose(getattr(one, field.name), expected, atol=1e-9, err_msg=field.name)
+    problem = OnlineJointSpaceProblem(
+        LIMITS, position=keys[0], velocity=velocity, start_time=3.0, goal=keys[-1], terms=(slow,),
+        config=JointSpaceMpcConfig(samples=60),
+    )  # fmt: skip
+    evaluation = problem.evaluate(keys[None, 1:-1])
+    cost, valid = problem.assess(trajectory)
+    assert cost == pytest.approx(evaluation.cost[0], rel=1e-9) and valid == evaluation.valid[0]

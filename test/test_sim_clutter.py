@@ -127,37 +127,46 @@ def outcome(letters="LR", duration=5.0, valid=True, milliseconds=50.0, hits=0):
 
 
 GOOD = [outcome(), outcome("R", 4.9), outcome("LTR", 5.8)]
+MORE = [outcome(duration=4.6)]
 
 
 @pytest.mark.parametrize(
     ("plain", "more", "said"),
     [
-        (GOOD, [outcome(duration=4.6)], []),
-        ([*GOOD, outcome(valid=False)], [outcome(duration=4.6)], ["1 runs"]),
-        (GOOD[:2], [outcome(duration=4.6)], ["LTR was never found"]),
-        ([*GOOD[:2], outcome("LTR", 6.1)], [outcome(duration=4.6)], ["LTR from start_0.10_0.20 takes"]),
-        (GOOD, [outcome(duration=4.66)], ["do not reach 4.65 s"]),
-        (GOOD, [outcome(valid=False)], ["do not reach 4.65 s"]),
-        ([outcome("LR", milliseconds=101.0), *GOOD[1:]] * 2, [outcome(duration=4.6)], []),
+        (GOOD, MORE, []),
+        ([*GOOD, outcome(valid=False)], MORE, ["1 runs"]),
+        (GOOD[:2], MORE, []),  # by bad luck
+        (GOOD[1:], MORE, ["LR was never found"]),
+        ([GOOD[0], GOOD[2]], MORE, ["R was never found"]),
+        ([*GOOD[:2], outcome("LTR", 6.1)], MORE, ["LTR from start_0.10_0.20 takes"]),
+        (GOOD, [outcome(duration=4.66)], ["median of 4.66 s, asked 4.65 s"]),
+        (GOOD, [outcome(duration=4.7), *MORE, outcome(duration=4.8)], ["median of 4.70 s"]),  # not the best
+        (GOOD, [outcome(valid=False)], ["1 of 1 runs", "no valid run, asked 4.65 s"]),
+        (GOOD, [outcome(valid=False), *MORE], ["1 of 2 runs from start_0.10_0.20 with 7 via-points"]),
+        ([outcome("LR", milliseconds=101.0), *GOOD[1:]] * 2, MORE, []),
         ([outcome(each, 4.9, 1, 101.0) for each in ("LR", "R", "LTR")], GOOD[1:2], ["101 ms", "4.65 s"]),
-        ([*GOOD, outcome(hits=1)], [outcome(duration=4.6)], ["collide when sampled"]),
-        ([outcome(valid=False)], [outcome(valid=False)], ["1 runs", "LR", "R was", "LTR", "4.65"]),
+        ([*GOOD, outcome(hits=1)], MORE, ["collide when sampled"]),
+        ([outcome(valid=False)], [outcome(valid=False)], ["1 runs", "1 of 1", "LR", "R was", "4.65"]),
     ],
 )
 def test_every_shortcoming_is_told(plain, more, said):
     name = "start_0.10_0.20"
-    results = {name: clutter_2d.summarise(plain, {5: more})}
+    results = {name: clutter_2d.summarise(plain, {7: more})}
     found = clutter_2d.shortcomings(results, 100, clutter_2d.EXPECTED)
     assert len(found) == len(said)
     for words, line in zip(said, found, strict=True):
         assert words in line
-    assert clutter_2d.class_table(results).count(name) >= 1
+    notes = clutter_2d.unlucky(results, 100, {name: clutter_2d.EXPECTED[name]})
+    assert bool(notes) == ("LTR" not in results[name]["classes"])
+    table = clutter_2d.class_table(results, clutter_2d.EXPECTED)
+    assert table.count(name) >= 1 and ("5.15 s" in table) == ("LR" in results[name]["classes"])
+    assert "5.15 s" not in clutter_2d.class_table(results, {})
     assert clutter_2d.more_table(results).count(name) == 1
 
 
 def test_experiment_clutter_2d(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(clutter_2d, "LONG", clutter_2d.PLAIN)
-    monkeypatch.setattr(clutter_2d, "MORE_VIA_POINTS", (5,))
+    monkeypatch.setattr(clutter_2d, "MORE_VIA_POINTS", (7,))
     monkeypatch.setattr(clutter_2d, "MOST_MS", np.inf)
     monkeypatch.setattr(clutter_2d, "LONGEST_WITH_MORE", {"start_0.10_0.20": 5.3})
     arguments = ["experiment", "clutter_2d", "--runs", "2", "--seed", "1000", "--jobs", "1", "--out"]
@@ -171,6 +180,15 @@ def test_experiment_clutter_2d(tmp_path, monkeypatch, capsys):
         assert summary[name]["solve_ms_p50"] > 0.0
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
     assert (tmp_path / "table.md").read_text().startswith("| start")
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "known"),
+    [((0.1, 0.2), (0.4, 0.3), True), ((0.101, 0.2), (0.4, 0.3), False), ((0.1, 0.2), (0.4, 0.31), False)],
+)
+def test_only_the_problems_of_the_figure_have_reference_durations(start, goal, known):
+    found = clutter_2d._expected({"start_0.10_0.20": np.array(start)}, np.array(goal))
+    assert found == ({"start_0.10_0.20": clutter_2d.EXPECTED["start_0.10_0.20"]} if known else {})
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from sim_bridge.experiments.clutter import clutter_2d_mpc, moving_discs, mpc_run
 from sim_bridge.experiments.clutter.moving_discs import BouncingDisc, random_discs, stays
 from sim_bridge.experiments.clutter.mpc_runs import PERIOD, Task, VpstoController, run_task
 from sim_bridge.experiments.clutter.world import GOAL, LIMITS, STARTS
-from vpsto_ros.planning.joint_space import OnlineJointSpaceProblem
+from vpsto_ros.planning.joint_space_problem import OnlineJointSpaceProblem
 from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize
 
 START = "start_0.10_0.20"
@@ -78,9 +78,8 @@ def test_simulated_samples_keep_the_limits_and_follow_where_they_can():
     rng = np.random.default_rng(1)
     wanted = 0.2 * rng.standard_normal((50, 30, 2))
     velocity = np.array([0.08, -0.1])
-    velocities, positions = mppi.simulate(
-        np.array([0.2, 0.3]), velocity, wanted, PERIOD, LIMITS.velocity, LIMITS.acceleration
-    )
+    bounds = PERIOD, LIMITS.velocity, LIMITS.acceleration
+    velocities, positions = mppi.simulate(np.array([0.2, 0.3]), velocity, wanted, False, *bounds)
     steps = np.diff(velocities, axis=1, prepend=np.broadcast_to(velocity, (50, 1, 2)))
     assert (np.abs(velocities) <= LIMITS.velocity).all()
     assert (np.abs(steps) <= PERIOD * LIMITS.acceleration + 1e-15).all()
@@ -91,6 +90,8 @@ def test_simulated_samples_keep_the_limits_and_follow_where_they_can():
     np.testing.assert_allclose(
         positions, [0.2, 0.3] + np.cumsum(0.5 * PERIOD * (before + velocities), axis=1), atol=1e-14
     )
+    same = mppi.simulate(np.array([0.2, 0.3]), velocity, steps / PERIOD, True, *bounds)
+    np.testing.assert_allclose(same, (velocities, positions), atol=1e-14)
 
 
 def test_the_baseline_is_good_where_nothing_is_in_the_way():
@@ -98,6 +99,17 @@ def test_the_baseline_is_good_where_nothing_is_in_the_way():
     result = run_task(Task(baseline, "mppi", "open", False, 1000))
     quickest = straight([0.25, 0.3], GOAL).duration
     assert result.success and result.time_to_goal < quickest + 0.4
+
+
+def test_drawing_accelerations_stops_and_arrives_where_nothing_is_in_the_way():
+    settings = dataclasses.replace(clutter_2d_mpc.MPPI[clutter_2d_mpc.SHORT], accelerations=True)
+    baseline = mppi.Mppi(LIMITS, settings, np.random.default_rng(0))
+    velocity = np.array([0.08, -0.05])
+    after = baseline._simulated(STILL, velocity, baseline._stop(velocity)[None]).velocities[0]
+    np.testing.assert_allclose(after[0], velocity - np.sign(velocity) * PERIOD * LIMITS.acceleration)
+    np.testing.assert_allclose(after[4:], 0.0, atol=1e-15)
+    result = run_task(Task(settings, "mppi", "open", False, 1000))
+    assert result.contact is None and result.broken == []
 
 
 def test_both_controllers_simulate_the_same_number_of_points():
@@ -159,7 +171,8 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clutter_2d_mpc")
     quick = {horizon: dataclasses.replace(o, points=1000) for horizon, o in clutter_2d_mpc.MPPI.items()}
     arguments = argparse.Namespace(
-        runs=1, seed=1000, out=folder, jobs=1, scheduler=None, resume=False, no_sweep=True, no_animation=True
+        runs=1, seed=1000, out=folder, jobs=1, scheduler=None, resume=False, no_sweep=True, no_animation=True,
+        tune=False,
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clutter_2d_mpc, "MPPI", quick)

@@ -54,7 +54,10 @@ EXPECTED = {
 }
 """Durations [s] of a plain VP-STO by class of solution."""
 MARGIN = 1.02
-LONGEST_WITH_MORE = {"start_0.10_0.20": 4.65}
+RARE = {"LTR"}
+"""Found about 3 times in a hundred runs: one block of seeds in twenty does without, so that is only noted."""
+JUDGED_VIA_POINTS, LONGEST_WITH_MORE = 7, {"start_0.10_0.20": 4.65}
+"""The setting of more via-points whose median duration [s] is judged, and how long it may be."""
 MOST_MS = 100.0
 RUNS_FOR_ALL_CLASSES = 100
 
@@ -168,21 +171,32 @@ def run(arguments: argparse.Namespace) -> int:
             n: run_trials(
                 solve, _tasks(start, goal, n, LONG, few), execution, f"{name}, {n} via-points",
                 plan_in_clutter,
-            )  # fmt: skip
+            )
             for n in MORE_VIA_POINTS
         }
         results[name] = summarise(plain, more)
         clutter_2d_figure.write(folder / f"{name}.png", problem(start, goal, N_VIA), plain)
     summary = {"experiment": "clutter_2d", "seed": arguments.seed, "runs": arguments.runs, **results}
     write_summary(folder, summary)
-    tables = class_table(results) + "\n" + more_table(results)
+    expected = _expected(starts, goal)
+    tables = class_table(results, expected) + "\n" + more_table(results)
     (folder / "table.md").write_text(tables)
     print(f"{tables}\nresults in {folder}")
-    known = given is None and np.array_equal(goal, GOAL)
-    missed = shortcomings(results, arguments.runs, EXPECTED if known else {})
+    for note in unlucky(results, arguments.runs, expected):
+        print(f"note: {note}")
+    missed = shortcomings(results, arguments.runs, expected)
     return print_verdict(
         not missed, "; ".join(missed) or "every run valid at every instant, durations and time as wanted"
     )
+
+
+def _expected(starts: dict[str, NDArray], goal: NDArray) -> dict[str, dict[str, float]]:
+    """The reference durations of those starts that are exactly the ones of the figure, to its goal."""
+    return {
+        name: EXPECTED[name]
+        for name, start in starts.items()
+        if name in STARTS and np.array_equal(start, STARTS[name]) and np.array_equal(goal, GOAL)
+    }
 
 
 def _tasks(start: NDArray, goal: NDArray, n_via: int, config: VpstoConfig, seeds: range) -> list[Task]:
@@ -190,7 +204,11 @@ def _tasks(start: NDArray, goal: NDArray, n_via: int, config: VpstoConfig, seeds
 
 
 def summarise(plain: list[Outcome], more: dict[int, list[Outcome]]) -> dict[str, Any]:
-    """What the runs from one start show."""
+    """What the runs from one start show.
+
+    ``best_duration_s`` is the least of all runs, whatever the class and the number of via-points: the best
+    that is known, not what to expect of a run. For that there are the medians of the classes and settings.
+    """
     valid = [outcome for outcome in plain if outcome.valid]
     longer = {
         str(n): {
@@ -238,13 +256,18 @@ def _classes(outcomes: list[Outcome]) -> dict[str, dict[str, float]]:
 def shortcomings(results: dict[str, Any], runs: int, expected: dict[str, dict[str, float]]) -> list[str]:
     """Where the results fall short, in words.
 
-    The median of each class is compared with the duration of a plain VP-STO. The rarest class comes up a few
-    times in a hundred runs, so one that is missing counts from that number of runs on.
+    The median of each class is compared with the duration of a plain VP-STO, and so is that of one setting
+    with more via-points. A class that is not found counts from a hundred runs on, unless it is rare.
     """
     found = []
     for name, result in results.items():
         if result["invalid"]:
             found.append(f"{result['invalid']} runs from {name} are invalid")
+        found += [
+            f"{more['invalid']} of {more['runs']} runs from {name} with {n} via-points are invalid"
+            for n, more in result["more_via_points"].items()
+            if more["invalid"]
+        ]
         if result["hit_when_sampled"]:
             found.append(f"{result['hit_when_sampled']} valid motions from {name} collide when sampled")
         if result["solve_ms_p50"] > MOST_MS:
@@ -254,16 +277,29 @@ def shortcomings(results: dict[str, Any], runs: int, expected: dict[str, dict[st
                 median = result["classes"][letters]["duration_s"]
                 if median > MARGIN * duration:
                     found.append(f"{letters} from {name} takes {median:.2f} s, more than {duration} s + 2 %")
-            elif runs >= RUNS_FOR_ALL_CLASSES:
+            elif runs >= RUNS_FOR_ALL_CLASSES and letters not in RARE:
                 found.append(f"{letters} was never found from {name}")
-        longest = LONGEST_WITH_MORE.get(name, np.inf) if expected else np.inf
-        if (result["best_duration_more_via_points_s"] or np.inf) > longest:
-            found.append(f"more via-points do not reach {longest} s from {name}")
+        judged = result["more_via_points"].get(str(JUDGED_VIA_POINTS))
+        if name in expected and name in LONGEST_WITH_MORE and judged is not None:
+            median, longest = judged["median_duration_s"], LONGEST_WITH_MORE[name]
+            if median is None or median > longest:
+                took = "no valid run" if median is None else f"a median of {median:.2f} s"
+                found.append(f"{JUDGED_VIA_POINTS} via-points from {name}: {took}, asked {longest} s")
     return found
 
 
-def class_table(results: dict[str, Any]) -> str:
-    """The ways around the obstacles, with the plain setting."""
+def unlucky(results: dict[str, Any], runs: int, expected: dict[str, dict[str, float]]) -> list[str]:
+    """Rare classes that no run found, in words; no shortcoming, because that happens by chance."""
+    return [
+        f"{letters}, which about 3 of 100 runs find, was not found from {name} in {runs}"
+        for name, durations in expected.items()
+        for letters in durations
+        if letters in RARE and letters not in results[name]["classes"]
+    ]
+
+
+def class_table(results: dict[str, Any], expected: dict[str, dict[str, float]]) -> str:
+    """The ways around the obstacles, with the plain setting; with the known durations, where there are."""
     header = [
         "start", "passes above", "runs", "T median / best", "plain VP-STO", "invalid",
         "iterations, median / p90", "time, median / p99",
@@ -276,7 +312,7 @@ def class_table(results: dict[str, Any]) -> str:
             f"{r['solve_ms_p50']:.0f} / {r['solve_ms_p99']:.0f} ms",
         ]
         for letters, c in r["classes"].items():
-            known = EXPECTED.get(name, {}).get(letters)
+            known = expected.get(name, {}).get(letters)
             rows.append([
                 name, letters, f"{c['count']}", _seconds(c["duration_s"], c["best_duration_s"]),
                 f"{known} s" if known else "", *common,

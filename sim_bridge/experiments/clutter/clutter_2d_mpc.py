@@ -2,8 +2,8 @@
 
 Both controllers decide 20 times a second from the state one period ahead, keep the same limits and simulate
 the same number of trajectory points per step. Every executed motion is checked as a whole and at every
-instant: collisions, limits, steps. The baseline has been tuned on other seeds for each horizon; how it
-depends on the horizon is part of the table.
+instant: collisions, limits, steps. The baseline has been tuned on other seeds for each horizon, which
+``--tune`` shows; how it depends on the horizon is part of the table.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sim_bridge.experiments.clutter import mppi_tuning
 from sim_bridge.experiments.clutter.mpc_runs import PERIOD, Result, Task, run_task
 from sim_bridge.experiments.clutter.mppi import MppiConfig
 from sim_bridge.experiments.clutter.world import STARTS
@@ -27,8 +28,9 @@ from sim_bridge.experiments.runs import (
     success_interval,
     write_summary,
 )
+from sim_bridge.warm_up import plan_in_clutter
 from vpsto_ros.optimization.costs import CostWeights
-from vpsto_ros.planning.joint_space import JointSpaceMpcConfig
+from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 
 VPSTO = JointSpaceMpcConfig(weights=CostWeights(smoothness=0.01), spread=0.1)
 """Online VP-STO: up to five via-points, one per second that is left; 10 iterations of 25 candidates."""
@@ -45,10 +47,9 @@ MPPI = {
 }
 """The baseline with every horizon [s], tuned for it on seeds from 1000 on for the least time to the goal.
 
-Random search over temperature (0.0002 to 0.2), noise (0.2 to 2.5), knots, iterations (1, 2, 4, 8) and the
-weights, about 150 settings in all, from both starts and from an open one. Up to 1 s none gets out of the bay
-that the obstacle L forms: what can be reached from its bottom within 1 s is farther from the goal. The
-setting kept there is the quickest one in the open that does not collide.
+``--tune`` shows what becomes of it when temperature, noise, terminal weight or what is drawn are changed.
+Up to 1 s no setting there gets out of the bay that the obstacle L forms: what can be reached from its bottom
+within 1 s is farther from the goal. The setting kept is a quick one in the open that does not collide.
 """
 
 SHORT = 1.0
@@ -63,21 +64,32 @@ Groups = dict[str, list[Result]]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options beyond those that every experiment has."""
     parser.add_argument("--no-sweep", action="store_true", help="only the short horizon of the baseline")
+    parser.add_argument(
+        "--tune", action="store_true",
+        help="instead of the experiment, change the settings of the baseline one at a time (seeds >= 1000)",
+    )  # fmt: skip
     parser.add_argument("--no-animation", action="store_true", help="do not draw moving_discs.gif")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run both controllers on the same worlds; 0 when VP-STO always arrives without collision."""
+    if arguments.tune:
+        return mppi_tuning.run(arguments, MPPI)
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     tasks = _tasks(seeds, sweep=not arguments.no_sweep)
-    flat = [task for group in tasks.values() for task in group]
-    results = iter(run_trials(run_task, flat, Execution.from_arguments(arguments), "clutter_2d_mpc"))
-    groups = {name: [next(results) for _ in group] for name, group in tasks.items()}
+    different = list(dict.fromkeys(task for group in tasks.values() for task in group))
+    execution = Execution.from_arguments(arguments)
+    results = run_trials(run_task, different, execution, "clutter_2d_mpc", plan_in_clutter)
+    by_task = dict(zip(different, results, strict=True))
+    groups = {name: [by_task[task] for task in group] for name, group in tasks.items()}
     return _report(pathlib.Path(arguments.out), groups, arguments)
 
 
 def _tasks(seeds: Sequence[int], *, sweep: bool) -> dict[str, list[Task]]:
-    """All runs by group: ``controller/start``, ``controller/moving`` and ``horizon/seconds/start``."""
+    """All runs by group: ``controller/start``, ``controller/moving`` and ``horizon/seconds/start``.
+
+    A run that belongs to two groups, with the short horizon of the baseline, is the same task in both.
+    """
     controllers: dict[str, JointSpaceMpcConfig | MppiConfig] = {"vpsto": VPSTO, "mppi": MPPI[SHORT]}
     groups = {}
     for name, config in controllers.items():

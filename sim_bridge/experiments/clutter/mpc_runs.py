@@ -16,7 +16,8 @@ from sim_bridge.experiments.clutter.moving_discs import BouncingDisc, measured, 
 from sim_bridge.experiments.clutter.mppi import Mppi, MppiConfig
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS, homotopy_class
 from vpsto_ros.collision.planar_discs import DiscMargin, MovingDisc
-from vpsto_ros.planning.joint_space import JointSpaceMpc, JointSpaceMpcConfig
+from vpsto_ros.planning.joint_space import JointSpaceMpc
+from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 from vpsto_ros.planning.stitching import extended, remainder
 from vpsto_ros.trajectory import Trajectory
 

@@ -4,11 +4,12 @@ Velocities over a short horizon are drawn around the present sequence, simulated
 exp(-cost / temperature); the first step is applied, and the rest is where the next one begins. The noise is
 drawn at a few knots and interpolated, and standing still is always among the samples, both as in the sampling
 MPC that the thesis compares to (4.5.1). The limits of velocity and acceleration hold at every instant,
-because every sample is clamped to them while it is simulated. Noise on accelerations instead was tried: it
-settles at the goal more slowly, and not at all with long horizons.
+because every sample is clamped to them while it is simulated. Accelerations can be drawn instead; what that
+and other settings do, ``vpsto experiment clutter_2d_mpc --tune`` tells.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -32,7 +33,8 @@ class MppiConfig:
     points: int = option(12_500, "simulated points per control step, over all iterations", minimum=100)
     iterations: int = option(2, "how often the sequence is improved per control step", minimum=1)
     temperature: float = option(0.003, "temperature of the weights, in the unit of the cost", minimum=1e-9)
-    noise: float = option(1.5, "standard deviation of velocities, relative to the limit", minimum=1e-6)
+    accelerations: bool = option(False, "draw accelerations instead of velocities")
+    noise: float = option(1.5, "standard deviation of what is drawn, relative to its limit", minimum=1e-6)
     finest: float = option(
         1.0, "smallest standard deviation relative to the greatest; samples have all from one to the other",
         minimum=1e-6, maximum=1.0,
@@ -80,34 +82,47 @@ class Mppi:
             samples, cost = self._sample(position, velocity, goal, world)
             weights = np.exp(-(cost - cost.min()) / self.config.temperature)
             self.sequence = np.tensordot(weights / weights.sum(), samples, axes=1)
-        mean, positions = self._simulated(position, velocity, self.sequence[None])
+        mean = self._simulated(position, velocity, self.sequence[None])
         one_hit = self.config.collision / self.config.steps
-        if self._cost(mean, positions, goal, world)[0] > cost.min() + one_hit:
-            mean = samples[None, int(cost.argmin())]  # the average of good ways may be a bad one
-        self.sequence = np.vstack([mean[0, 1:], np.zeros((1, self.limits.dof))])
-        return (mean[0, 0] - velocity) / self.config.period
+        if self._cost(mean, goal, world)[0] > cost.min() + one_hit:
+            best = samples[None, int(cost.argmin())]  # the average of good ways may be a bad one
+            mean = self._simulated(position, velocity, best)
+        self.sequence = np.vstack([mean.commands[0, 1:], np.zeros((1, self.limits.dof))])
+        return (mean.velocities[0, 0] - velocity) / self.config.period
 
     def _sample(
         self, position: NDArray, velocity: NDArray, goal: NDArray, world: PlanarWorld
     ) -> tuple[NDArray, NDArray]:
-        """Velocities (M, H, n) within the limits and their costs (M,); the second sample comes to rest."""
+        """Sequences (M, H, n) within the limits and their costs (M,); the second one comes to rest."""
         config, n = self.config, self.limits.dof
+        limit = self.limits.acceleration if config.accelerations else self.limits.velocity
         noise = self.rng.standard_normal((config.samples, self._interpolation.shape[1], n))
         noise *= np.geomspace(1.0, config.finest, config.samples)[:, None, None]
-        wanted = self.sequence + config.noise * self.limits.velocity * (self._interpolation @ noise)
-        wanted[0], wanted[1] = self.sequence, 0.0
-        samples, positions = self._simulated(position, velocity, wanted)
-        return samples, self._cost(samples, positions, goal, world)
+        wanted = self.sequence + config.noise * limit * (self._interpolation @ noise)
+        wanted[0], wanted[1] = self.sequence, self._stop(velocity)
+        rollouts = self._simulated(position, velocity, wanted)
+        return rollouts.commands, self._cost(rollouts, goal, world)
 
-    def _simulated(
-        self, position: NDArray, velocity: NDArray, wanted: NDArray
-    ) -> tuple[NDArray, NDArray]:
-        """Velocities (M, H, n) as near to the wanted ones as the limits allow, and positions."""
-        limits = self.limits
-        return simulate(position, velocity, wanted, self.config.period, limits.velocity, limits.acceleration)
+    def _stop(self, velocity: NDArray) -> NDArray:
+        """The sequence (H, n) that comes to rest as fast as the limits allow."""
+        if not self.config.accelerations:
+            return np.zeros_like(self.sequence)
+        steps = np.arange(self.config.steps)[:, None]
+        left = np.abs(velocity) / self.config.period - steps * self.limits.acceleration
+        return -np.sign(velocity) * np.clip(left, 0.0, self.limits.acceleration)
 
-    def _cost(self, velocities: NDArray, positions: NDArray, goal: NDArray, world: PlanarWorld) -> NDArray:
-        config = self.config
+    def _simulated(self, position: NDArray, velocity: NDArray, wanted: NDArray) -> "Rollouts":
+        """What the limits leave of the wanted sequences (M, H, n), and where it leads."""
+        period, limits, accelerating = self.config.period, self.limits, self.config.accelerations
+        velocities, positions = simulate(
+            position, velocity, wanted, accelerating, period, limits.velocity, limits.acceleration
+        )
+        first = np.broadcast_to(velocity, (len(wanted), 1, limits.dof))
+        commands = np.diff(velocities, axis=1, prepend=first) / period if accelerating else velocities
+        return Rollouts(commands, velocities, positions)
+
+    def _cost(self, rollouts: "Rollouts", goal: NDArray, world: PlanarWorld) -> NDArray:
+        config, velocities, positions = self.config, rollouts.velocities, rollouts.positions
         distance = np.linalg.norm(positions - goal, axis=2)
         hit = world.inside(positions, config.period * np.arange(1, config.steps + 1))
         return (
@@ -118,16 +133,34 @@ class Mppi:
         )
 
 
+class Rollouts(NamedTuple):
+    """Simulated sequences, each array (M, H, n).
+
+    Attributes:
+        commands: what is drawn and averaged: velocities, or accelerations.
+        velocities: after every period [1/s].
+        positions: after every period.
+    """
+
+    commands: NDArray
+    velocities: NDArray
+    positions: NDArray
+
+
 @njit(cache=True, nogil=True)
-def simulate(position, velocity, wanted, period, fastest, strongest):
-    """Velocities and positions (M, H, n) after every period under constant acceleration in between."""
+def simulate(position, velocity, wanted, accelerating, period, fastest, strongest):
+    """Velocities and positions (M, H, n) after every period under constant acceleration in between.
+
+    `wanted` (M, H, n) are velocities at the ends of the periods or, if `accelerating`, accelerations in them.
+    """
     samples, steps, dof = wanted.shape
     velocities, positions = np.empty_like(wanted), np.empty_like(wanted)
     for m in range(samples):
         for j in range(dof):
             q, v, most = position[j], velocity[j], period * strongest[j]
             for k in range(steps):
-                after = min(max(wanted[m, k, j], -fastest[j]), fastest[j])
+                after = v + period * wanted[m, k, j] if accelerating else wanted[m, k, j]
+                after = min(max(after, -fastest[j]), fastest[j])
                 after = min(max(after, v - most), v + most)
                 q += 0.5 * period * (v + after)
                 v = after
