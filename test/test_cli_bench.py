@@ -45,7 +45,7 @@ def test_rows_have_the_promised_columns(tmp_path, monkeypatch, capsys):
     assert [(row["name"], row["cores"]) for row in rows] == [
         ("first", 1), ("first", 2), ("second", 1), ("second", 2),
     ]  # fmt: skip
-    assert set(rows[0]) == {"name", "cores", "p50_ms", "p99_ms", "max_ms", "mean_ms", "noise"}
+    assert set(rows[0]) == {"name", "cores", "p50_ms", "p99_ms", "max_ms", "mean_ms", "noise", "quick"}
     printed = capsys.readouterr().out
     assert [line.split()[:2] for line in printed.splitlines()[1:5]] == [
         ["first", "1"], ["first", "2"], ["second", "1"], ["second", "2"],
@@ -285,7 +285,8 @@ def test_comparison_from_the_command_line(tmp_path, capsys, one_row, old_ms, arg
     command = ["bench", "--quick", "--compare", str(tmp_path / "old.json"), *arguments]
     assert cli.main(command) == status
     printed = capsys.readouterr().out
-    assert f"{2.0 / old_ms:.2f}" in printed and ("slower" in printed) == (old_ms == 1.0)
+    assert f"{2.0 / old_ms:.2f}" in printed and ("| slower" in printed) == (old_ms == 1.0)
+    assert "one of the two was measured with --quick" in printed
     assert "only old: gone (1 core)" in printed
     assert ("FAILED: more than 1.5 times as long: only" in printed) == (status == 1)
 
@@ -321,5 +322,11 @@ def test_options_that_cannot_work_are_refused_before_measuring(tmp_path, monkeyp
     monkeypatch.setattr(bench, "measure_all", None)
     with pytest.raises(ConfigurationError, match="--fail-above needs --compare"):
         bench.run(options(fail_above=1.5))
-    with pytest.raises(ConfigurationError, match="there is no such folder"):
+    with pytest.raises(ConfigurationError, match="--json .*bench.json: No such file or directory"):
         bench.run(options(json=str(tmp_path / "nowhere" / "bench.json")))
+    full = tmp_path / "full.json"
+    full.write_text(json.dumps([row_entries("driver", 1.0), row_entries("first_plan", 1.0)]))
+    with pytest.raises(ConfigurationError, match="holds 1 rows that are not measured now and would be lost"):
+        bench.run(options(only="first_plan", json=str(full)))
+    with pytest.raises(ConfigurationError, match="this is the file to compare with"):
+        bench.run(options(json=str(full), compare=str(full)))

@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from sim_bridge.bench import library_rows, system_rows
-from sim_bridge.bench.comparison import compare, comparison_table, read_rows
+from sim_bridge.bench.comparison import compare, comparison_table, place, read_rows
 from sim_bridge.bench.growth import growth_tables
 from sim_bridge.bench.measuring import QUICK, Effort, Row, measure_once, statistics, usable_cores
 from sim_bridge.experiments.runs import print_verdict
@@ -46,9 +46,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.check and not any(row.wanted for row in rows):
         raise ConfigurationError("--check: no figure is wanted of these rows")
     old = read_rows(arguments.compare) if arguments.compare else None
-    if arguments.json and not pathlib.Path(arguments.json).absolute().parent.is_dir():
-        raise ConfigurationError(f"--json {arguments.json}: there is no such folder")
+    if old is not None and arguments.only:
+        old = [row for row in old if arguments.only in row["name"]]
+    if arguments.json:
+        check_output(arguments.json, rows, arguments.compare)
     measured = measure_all(rows, QUICK if arguments.quick else Effort())
+    for row in measured:
+        row["quick"] = bool(arguments.quick)
     if arguments.json:
         pathlib.Path(arguments.json).write_text(json.dumps(measured, indent=2) + "\n")
     growth = growth_tables(measured)
@@ -56,6 +60,29 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"\n{growth}", end="")
     changed = 0 if old is None else report_changes(old, measured, arguments.fail_above)
     return max(changed, report_wanted(measured) if arguments.check else 0)
+
+
+def check_output(path: str, rows: Sequence[Row], compare: str | None) -> None:
+    """Refuse, before minutes of measuring, a file that cannot be written or whose rows would be lost.
+
+    Raises:
+        ConfigurationError: the message says why.
+    """
+    file = pathlib.Path(path)
+    if compare and file.absolute() == pathlib.Path(compare).absolute():
+        raise ConfigurationError(f"--json {path}: this is the file to compare with; give another one")
+    if file.exists() and file.stat().st_size:
+        lost = {row["name"] for row in read_rows(file, "--json")} - {row.name for row in rows}
+        if lost:
+            raise ConfigurationError(
+                f"--json {path}: holds {len(lost)} rows that are not measured now and would be lost, such as "
+                f"{min(lost)}; give another file"
+            )
+    try:
+        with file.open("a"):
+            pass
+    except OSError as error:
+        raise ConfigurationError(f"--json {path}: {error.strerror or error}") from error
 
 
 def measure_all(rows: Sequence[Row], effort: Effort) -> list[dict[str, Any]]:
@@ -107,11 +134,13 @@ def report_changes(
     """
     changes = compare(old, new)
     print(f"\n{comparison_table(changes, old, new)}", end="")
+    if any(row.get("quick", False) for row in old) != any(row.get("quick", False) for row in new):
+        print("one of the two was measured with --quick, whose few repetitions say other things")
     if fail_above is None:
         return 0
     above = [change for change in changes if change["ratio"] > fail_above]
-    worse = [change["name"] for change in above if change["verdict"] == "slower"]
-    unclear = [change["name"] for change in above if change["verdict"] != "slower"]
+    worse = [place(change) for change in above if change["verdict"] == "slower"]
+    unclear = [place(change) for change in above if change["verdict"] != "slower"]
     if unclear:
         print(f"too noisy to be judged, repeat on a quiet machine: {', '.join(unclear)}")
     verdict = f"FAILED: more than {fail_above:g} times as long: {', '.join(worse)}" if worse else "passed"

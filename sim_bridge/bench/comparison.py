@@ -18,8 +18,12 @@ BAND_WIDTH = 3.0
 """Standard deviations of the difference that count as noise."""
 
 
-def read_rows(path: str | pathlib.Path) -> list[Entries]:
+def read_rows(path: str | pathlib.Path, option: str = "--compare") -> list[Entries]:
     """Rows written by ``vpsto bench --json``, also by an older version that had fewer or other entries.
+
+    Args:
+        path: of the file.
+        option: that named it, for messages.
 
     Raises:
         ConfigurationError: when the file is missing or does not hold such rows.
@@ -27,11 +31,11 @@ def read_rows(path: str | pathlib.Path) -> list[Entries]:
     try:
         rows = json.loads(pathlib.Path(path).read_text())
     except OSError as error:
-        raise ConfigurationError(f"--compare {path}: {error.strerror or error}") from error
+        raise ConfigurationError(f"{option} {path}: {error.strerror or error}") from error
     except ValueError as error:
-        raise ConfigurationError(f"--compare {path}: not JSON ({error})") from error
+        raise ConfigurationError(f"{option} {path}: not JSON ({error})") from error
     if not isinstance(rows, list) or not rows or not all(map(_is_row, rows)):
-        raise ConfigurationError(f"--compare {path}: not a file written by `vpsto bench --json`")
+        raise ConfigurationError(f"{option} {path}: not a file written by `vpsto bench --json`")
     return rows
 
 
@@ -81,7 +85,7 @@ def comparison_table(changes: Sequence[Entries], old: Sequence[Entries], new: Se
         for change in changes
     ]  # fmt: skip
     text = markdown_table(header, rows) if rows else "no row is in both measurements\n"
-    known, measured = (list(map(_place, side)) for side in (old, new))
+    known, measured = (list(map(place, side)) for side in (old, new))
     for label, side, other in (("only new", measured, known), ("only old", known, measured)):
         missing = [place for place in side if place not in other]
         if missing:
@@ -89,6 +93,7 @@ def comparison_table(changes: Sequence[Entries], old: Sequence[Entries], new: Se
     return text
 
 
-def _place(row: Entries) -> str:
+def place(row: Entries) -> str:
+    """Name of a row with the number of cores it was measured on."""
     cores = row.get("cores", 1)
     return f"{row['name']} ({cores} core{'s' if cores > 1 else ''})"
