@@ -322,7 +322,7 @@ def test_options_that_cannot_work_are_refused_before_measuring(tmp_path, monkeyp
     monkeypatch.setattr(bench, "measure_all", None)
     with pytest.raises(ConfigurationError, match="--fail-above needs --compare"):
         bench.run(options(fail_above=1.5))
-    with pytest.raises(ConfigurationError, match="--json .*bench.json: No such file or directory"):
+    with pytest.raises(ConfigurationError, match=r"--json .*bench\.json: No such file or directory"):
         bench.run(options(json=str(tmp_path / "nowhere" / "bench.json")))
     full = tmp_path / "full.json"
     full.write_text(json.dumps([row_entries("driver", 1.0), row_entries("first_plan", 1.0)]))
