@@ -26,15 +26,32 @@ def write(path: pathlib.Path, outcomes: Mapping[tuple[str, str], Sequence[Any]])
 
     from sim_bridge.experiments.clutter.cholesky import STRATEGIES
 
-    figure, grid = plt.subplots(2, 3, figsize=(13, 8), layout="constrained")
+    figure, grid = plt.subplots(2, 3, figsize=(13, 8.6), layout="constrained")
+    figure.suptitle("Search around one obstacle, with and without the smoothness prior")
     for row, strategy in zip(grid, STRATEGIES, strict=True):
         for axes, start in zip(row, ("without_prior", "with_prior"), strict=False):
             _paths(axes, start, outcomes[strategy, start])
             axes.set_title(f"{STRATEGIES[strategy]}, {start.replace('_', ' ')}", fontsize=10)
         _costs(row[2], {start: outcomes[strategy, start] for start in COLOURS})
         row[2].set_title(f"{STRATEGIES[strategy]}: cost of the mean", fontsize=10)
+    figure.legend(handles=_explained(), loc="outside lower center", ncols=3, fontsize=10)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _explained() -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    blue, orange = COLOURS["with_prior"], COLOURS["without_prior"]
+    return [
+        Line2D([], [], color="0.6", label="candidates of a first population"),
+        Line2D([], [], color="k", ls="--", label="straight from start to goal"),
+        Line2D([], [], color=blue, label="with prior: paths found; median cost"),
+        Line2D([], [], color=orange, label="without prior: paths found; median cost"),
+        Patch(color=blue, alpha=0.2, label="with prior: costs of the middle 90 % of the runs"),
+        Patch(color=orange, alpha=0.2, label="without prior: costs of the middle 90 % of the runs"),
+    ]
 
 
 def _paths(axes: Any, start: str, runs: Sequence[Any]) -> None:
@@ -62,7 +79,6 @@ def _costs(axes: Any, runs: Mapping[str, Sequence[Any]]) -> None:
         low, middle, high = np.quantile(costs, [0.05, 0.5, 0.95], axis=0)
         iterations = np.arange(1, longest + 1)
         axes.fill_between(iterations, low, high, color=COLOURS[start], alpha=0.2)
-        axes.plot(iterations, middle, color=COLOURS[start], label=start.replace("_", " "))
+        axes.plot(iterations, middle, color=COLOURS[start])
     axes.set(xscale="log", yscale="log", xlabel="iteration", ylabel="duration + 100 x time in collision [s]")
     axes.grid(alpha=0.3)
-    axes.legend()

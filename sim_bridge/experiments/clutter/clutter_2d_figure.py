@@ -27,7 +27,11 @@ def write(path: pathlib.Path, problem: JointSpaceProblem, outcomes: Sequence[Any
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(13, 6), layout="constrained")
+    figure = plt.figure(figsize=(13, 6.3), layout="constrained")
+    start, (via, _) = problem.start, np.shape(outcomes[0].points)
+    figure.suptitle(
+        f"{len(outcomes)} searches from ({start[0]:.2f} m, {start[1]:.2f} m) with {via} free via-points"
+    )
     grid: Any = figure.subfigures(1, 2, width_ratios=(1.0, 1.15))
     left, right = grid
     _paths(left.subplots(), problem, outcomes)
@@ -42,18 +46,28 @@ def _colour(outcome: Any) -> str:
 
 def _paths(axes: Any, problem: JointSpaceProblem, outcomes: Sequence[Any]) -> None:
     draw_world(axes)
-    labels = [f"above {each.letters}" if each.valid else "in collision" for each in outcomes]
+    labels = [_way(each.letters) if each.valid else "in collision or out of limits" for each in outcomes]
     told = set()
     for outcome, label in zip(outcomes, labels, strict=True):
         trajectory = problem.trajectory(outcome.points)
         path = trajectory(np.linspace(0.0, trajectory.duration, 300))
-        legend = None if label in told else f"{label}: {labels.count(label)} runs"
+        legend = None if label in told else f"{label} (runs: {labels.count(label)})"
         axes.plot(*path.T, color=_colour(outcome), lw=0.8, alpha=0.6, label=legend, zorder=2)
         told.add(label)
     goal = problem.start if problem.goal is None else problem.goal
-    axes.plot(*problem.start, "ko", zorder=3)
-    axes.plot(*goal, "k*", ms=12, zorder=3)
-    axes.legend(loc="lower right", fontsize=8)
+    axes.plot(*problem.start, "ko", ls="none", zorder=3, label="start")
+    axes.plot(*goal, "k*", ms=12, ls="none", zorder=3, label="goal")
+    legend = axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2, fontsize=9)
+    for line in legend.get_lines():
+        line.set(alpha=1.0, lw=1.5 if line.get_marker() == "None" else 0.0)
+
+
+def _way(letters: str) -> str:
+    """The obstacles that a path passes above, in words."""
+    if letters == "-":
+        return "passes below all obstacles"
+    *others, last = letters
+    return f"passes above {', '.join(others)}{' and ' if others else ''}{last}"
 
 
 def _profiles(grid: Any, problem: JointSpaceProblem, outcomes: Sequence[Any]) -> None:
@@ -74,5 +88,5 @@ def _profiles(grid: Any, problem: JointSpaceProblem, outcomes: Sequence[Any]) ->
                 axes.axhline(-most, color="k", ls="--", lw=0.8)
             axes.grid(alpha=0.3)
             axes.set_ylabel(quantity if axis == 0 else "")
-            axes.set_title("xy"[axis] if order == 0 else "")
+            axes.set_title(f"{'xy'[axis]} (dashed: limits)" if order == 0 else "")
             axes.set_xlabel("time [s]" if order == 2 else "")

@@ -70,13 +70,22 @@ def _crossings_above(path: NDArray, middle: NDArray) -> int:
     return int(np.where(right[steps + 1], 1, -1)[above].sum())
 
 
+def _deepest(world: PlanarWorld, polygon: NDArray) -> NDArray:
+    """The point inside a polygon that is furthest from its border, about: the mean may be near a notch."""
+    sides = np.linspace(polygon.min(axis=0), polygon.max(axis=0), 25).T
+    points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    alone = PlanarWorld(lower=world.lower, upper=world.upper, polygons=(polygon,))
+    off_centre = np.linalg.norm(points - polygon.mean(axis=0), axis=1)
+    return points[np.argmin(alone.clearance(points) + 0.05 * off_centre)]
+
+
 def draw_world(axes: Any, world: PlanarWorld = CLUTTER, time: float = 0.0) -> None:
     """Draw obstacles, discs as they are at a time [s], and bounds into matplotlib axes."""
     from matplotlib.patches import Circle
 
     for name, polygon in zip(world.names, world.polygons, strict=True):
         axes.fill(*polygon.T, facecolor="0.8", edgecolor="0.5", lw=0.8, zorder=1)
-        axes.text(*polygon.mean(axis=0), name, ha="center", va="center", color="0.35", zorder=1)
+        axes.text(*_deepest(world, polygon), name, ha="center", va="center", color="0.35", zorder=1)
     for disc in world.discs:
         axes.add_patch(Circle(tuple(disc.position(time)), disc.radius, facecolor="0.6", zorder=1))
     axes.set(

@@ -11,7 +11,9 @@ from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.shapes import Box, Capsule, HalfSpace, Shape, Sphere
 from vpsto_ros.robot.kinematics import forward_kinematics_batch
 
-_POSTURES = ((0.0, "#3a7d44", 0.9), (0.33, "#8fa3ad", 0.35), (0.67, "#8fa3ad", 0.35), (1.0, "#0b6e83", 0.9))
+_START, _BETWEEN, _GOAL = "#3a7d44", "#8fa3ad", "#0b4f9c"
+_POSTURES = ((0.0, _START, 0.9), (0.33, _BETWEEN, 0.35), (0.67, _BETWEEN, 0.35), (1.0, _GOAL, 0.9))
+_TIP = "#c1121f"
 _OBSTACLE = "#c8803a"
 _TABLE = "#e8e0d2"
 
@@ -37,11 +39,25 @@ def draw_solutions(
         axes = figure.add_subplot(rows, columns, number + 1, projection="3d")
         _draw(axes, task, postures)
         axes.set_title(title, fontsize=10)
-    figure.tight_layout()
+    figure.tight_layout(rect=(0.0, 0.5 / (5.0 * rows), 1.0, 1.0))
+    figure.legend(handles=_explained(), loc="lower center", ncols=5 if columns > 1 else 2, fontsize=11)
     path = folder / "solutions.png"
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
+
+
+def _explained() -> list:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    return [
+        Patch(color=_START, label="arm at the start"),
+        Patch(color=_BETWEEN, alpha=0.6, label="after a third and two thirds"),
+        Patch(color=_GOAL, label="arm at the goal"),
+        Line2D([], [], color=_TIP, lw=2.0, label="path of the tip"),
+        Patch(color=_OBSTACLE, alpha=0.6, label="obstacles"),
+    ]
 
 
 def _draw(axes, task: ReachTask, postures: NDArray) -> None:
@@ -52,7 +68,7 @@ def _draw(axes, task: ReachTask, postures: NDArray) -> None:
         for capsule in checker.capsules(postures[round(share * (len(postures) - 1))]):
             _add(axes, capsule, colour, opacity)
     tip = forward_kinematics_batch(postures)
-    axes.plot(*tip.T, color="#c1121f", linewidth=2.0, zorder=10)
+    axes.plot(*tip.T, color=_TIP, linewidth=2.0, zorder=10)
     axes.set(
         xlim=(-0.9, 0.9), ylim=(-0.9, 0.9), zlim=(0.0, 1.4), xlabel="x [m]", ylabel="y [m]", zlabel="z [m]"
     )

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
+from sim_bridge.experiments.timing import key_timing_figure
 from sim_bridge.warm_up import evaluate_a_trajectory
 from vpsto_ros.trajectory import (
     Limits,
     OptimalBasis,
-    TimedKeys,
-    Trajectory,
     minimal_duration,
-    synthesize,
     time_key_positions,
 )
 
@@ -129,7 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
     table = _table(rows)
     (folder / "table.md").write_text(table)
     keys, limits = key_positions(Task("plane_uneven", COUNTS[1], arguments.seed))
-    _draw(folder / "key_timing.png", keys, limits, time_key_positions(keys, limits))
+    key_timing_figure.write(folder / "key_timing.png", keys, limits, time_key_positions(keys, limits))
     print(f"{table}\nresults in {folder}")
     return verdict(summary)
 
@@ -179,41 +177,3 @@ def _table(rows: list[dict]) -> str:
 
 def _spread(row: dict, name: str) -> str:
     return f"{row[name + '_p50']:.3f} ({row[name + '_p10']:.3f}-{row[name + '_p90']:.3f})"
-
-
-def _draw(path: pathlib.Path, keys: NDArray, limits: Limits, timed: TimedKeys) -> None:
-    """The two paths through the same key positions, and the profiles with the limits."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    still = np.zeros(limits.dof)
-    equal = synthesize(OptimalBasis.uniform(len(keys) - 2), keys, still, still, limits)
-    figure, axes = plt.subplot_mosaic(
-        [["path", "v0", "v1"], ["path", "a0", "a1"]], figsize=(12, 5), layout="constrained"
-    )
-    labels = f"equal spacing, {equal.duration:.2f} s", f"optimised timing, {timed.duration:.2f} s"
-    for motion, colour, label in zip(
-        (equal, timed.trajectory), ("tab:gray", "tab:blue"), labels, strict=True
-    ):
-        _draw_motion(axes, motion, colour, label)
-    axes["path"].plot(*keys.T, "o", color="black", zorder=3, label="key positions")
-    axes["path"].set(xlabel="$q_1$", ylabel="$q_2$", aspect="equal")
-    axes["path"].legend()
-    for name, symbol, limit in (("v", r"\dot q", limits.velocity), ("a", r"\ddot q", limits.acceleration)):
-        for j in (0, 1):
-            for sign in (-1.0, 1.0):
-                axes[f"{name}{j}"].axhline(sign * limit[j], color="black", ls="--", lw=1)
-            axes[f"{name}{j}"].set(ylabel=f"${symbol}_{j + 1}$", xlabel="time [s]" if name == "a" else "")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-
-
-def _draw_motion(axes: dict, motion: Trajectory, colour: str, label: str) -> None:
-    times = np.linspace(motion.start_time, motion.end_time, 1000)
-    axes["path"].plot(*motion(times).T, color=colour, label=label)
-    for order, name in ((1, "v"), (2, "a")):
-        for j in (0, 1):
-            axes[f"{name}{j}"].plot(times, motion(times, order)[:, j], color=colour)
-            axes[f"{name}{j}"].plot(motion.times, motion(motion.times, order)[:, j], ".", color=colour, ms=6)

@@ -30,7 +30,8 @@ def write(
 
     counts = list(profiles)
     column = {key: np.array([rows[f"1d_{n}"][key] for n in counts]) for key in rows[f"1d_{counts[0]}"]}
-    figure, axes = plt.subplots(2, 2, figsize=(10, 6), layout="constrained")
+    figure, axes = plt.subplots(2, 2, figsize=(10, 6.6), layout="constrained")
+    figure.suptitle("One joint from rest to rest over a distance of 1, with N free via-points")
     _durations(axes[0, 0], counts, column, bang_bang)
     _iterations(axes[1, 0], counts, column)
     _profiles(axes[:, 1], profiles, limits)
@@ -53,6 +54,7 @@ def _iterations(axes, counts, column) -> None:
     axes.errorbar(counts, middle, spread, fmt="o", color="tab:blue", capsize=3)
     label = "iterations to converge\n(median, p10 to p90)"
     axes.set(xlabel="free via-points N", ylabel=label, xticks=counts, ylim=(0, None))
+    axes.set_title("VP-STO, uniform phases", fontsize=10)
 
 
 def _profiles(axes, profiles: dict[int, Trajectory], limits: Limits) -> None:
@@ -73,5 +75,6 @@ def _profiles(axes, profiles: dict[int, Trajectory], limits: Limits) -> None:
             axis.axhline(sign * limit, color="black", ls="--", lw=1)
         axis.set(ylabel=label)
     axes[0].set(ylim=(-0.1 * limits.velocity[0], 1.1 * limits.velocity[0]))
+    axes[0].set_title("solutions with uniform phases, and the limits (dashed)", fontsize=10)
     axes[1].set(xlabel="time [s]")
     axes[0].legend(ncols=3, fontsize="x-small", loc="lower left", bbox_to_anchor=(0.14, 0.05))
