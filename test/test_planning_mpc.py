@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from vpsto_ros.optimization.vpsto import Evaluation, VpstoConfig
+from vpsto_ros.optimization.progress import Evaluation
+from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineVpsto
 from vpsto_ros.planning.pushes import around, way_length
 from vpsto_ros.priors.smoothness import smoothness_prior

@@ -13,16 +13,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.optimization.cma import STRATEGIES, Strategy, has_collapsed, make_strategy
 from vpsto_ros.optimization.progress import RESERVES, Evaluation, Incumbents, Iteration, SearchResult, Timer
 from vpsto_ros.priors.gaussian import GaussianPrior
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class VpstoConfig:
     """Options of the search.
+
+    The defaults suit few iterations, as when replanning. With a hundred iterations or more, and up to some
+    sixty variables, ``strategy = "cma"`` is the better choice: it takes up to three times as long per iteration
+    and comes closer to the optimum of time-optimal motions and of few via-points among obstacles
+    (``vpsto experiment search``, rows "covariance adaptation").
 
     Raises:
         ConfigurationError: a value is out of range; the message names what is allowed.

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.exceptions import InvalidInputError, VpstoError
+from vpsto_ros.optimization.progress import SearchResult
 from vpsto_ros.optimization.terms import Term
-from vpsto_ros.optimization.vpsto import SearchResult
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig, OnlineJointSpaceProblem
 from vpsto_ros.planning.mpc import OnlineVpsto
 from vpsto_ros.planning.stitching import as_batch, extended, remainder, resting

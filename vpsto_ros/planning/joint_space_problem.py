@@ -5,16 +5,18 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.optimization.costs import CostWeights, JointSpaceProblem
+from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.terms import Term
-from vpsto_ros.optimization.vpsto import Evaluation, VpstoConfig
+from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.mpc import OnlineConfig
 from vpsto_ros.planning.stitching import as_batch
-from vpsto_ros.priors.smoothness import GaussianPrior
+from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class JointSpaceMpcConfig:
     """Options of :class:`JointSpaceMpc`.

@@ -14,9 +14,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
-from vpsto_ros.optimization.vpsto import Evaluation, SearchResult, VpstoConfig, search
-from vpsto_ros.priors.smoothness import GaussianPrior
+from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.optimization.progress import Evaluation, SearchResult
+from vpsto_ros.optimization.vpsto import VpstoConfig, search
+from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.trajectory import Trajectory
 
 
@@ -44,6 +45,7 @@ class OnlineProblem(Protocol):
         """First guesses (S, P, n), the most promising one first."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class OnlineConfig:
     """Options of online VP-STO."""

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.progress import SearchResult
@@ -24,9 +24,10 @@ from vpsto_ros.trajectory import OptimalBasis, synthesize_batch
 _LARGEST_DRAW = 8  # postures drawn for one that is kept
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class ReachConfig:
-    """Options of :func:`plan_reach`.
+    """Options of :func:`plan_reach`; ``vpsto experiment search`` varies them in its table of reaching.
 
     Raises:
         ConfigurationError: a value is out of range.

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.priors.gaussian import GaussianPrior, SeparablePrior, solve  # noqa: F401
+from vpsto_ros.priors.gaussian import SeparablePrior, solve
 
 if TYPE_CHECKING:
     from vpsto_ros.trajectory.basis import OptimalBasis

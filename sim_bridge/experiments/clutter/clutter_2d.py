@@ -3,7 +3,8 @@
 The reference setting is the plain one: three free via-points, 25 candidates, 200 iterations of CMA-ES, no
 restart, the cost being the duration and 100 per second in collision. The first population comes from the
 smoothness prior around the straight line with a mean standard deviation of 0.1 m, a third of the way to the
-goal. Spread and weight were chosen on seeds from 1000 on.
+goal. Spread and weight were chosen on seeds from 1000 on. The rows "plain setting" of
+``vpsto experiment search`` compare strategy and spread with others.
 
 A second table gives the search more via-points and restarts: it begins anew whenever it has converged, until
 2000 iterations are used up (50 000 candidates), with a tenth of the runs.

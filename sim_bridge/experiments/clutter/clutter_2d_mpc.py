@@ -33,7 +33,10 @@ from vpsto_ros.optimization.costs import CostWeights
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 
 VPSTO = JointSpaceMpcConfig(weights=CostWeights(smoothness=0.01), spread=0.1)
-"""Online VP-STO: up to five via-points, one per second that is left; 10 iterations of 25 candidates."""
+"""Online VP-STO: up to five via-points, one per second that is left; 10 iterations of 25 candidates.
+
+The table of replanning in ``vpsto experiment search`` varies every option round this setting.
+"""
 
 _REACTIVE = MppiConfig(iterations=4, knots=3, noise=1.17, speed=0.3)
 _FAR = MppiConfig(iterations=2, noise=1.5, running=0.3)

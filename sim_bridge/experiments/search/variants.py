@@ -168,9 +168,9 @@ def _reaching(
 
 
 REACHING = (
-    _reaching("guesses per round", _values("guesses", REACH.guesses, (0, 30, 300))),
+    _reaching("guesses per round", _values("guesses", REACH.guesses, (0, 300))),
     _reaching("share of guesses near the line", _values("near", REACH.near, (0.0, 1.0))),
-    _reaching("spread of these [rad]", _values("near_spread", REACH.near_spread, (0.3, 1.4))),
+    _reaching("spread of these [rad]", _values("near_spread", REACH.near_spread, (0.3,))),
     _reaching("reaching: spread of the prior [rad]", _values("spread", REACH.spread, (0.3, 1.2))),
     _reaching(
         f"starts at {ROUND_EVALUATIONS} evaluations per round",

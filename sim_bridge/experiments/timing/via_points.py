@@ -9,6 +9,8 @@ With uniform phases the optimum is 10 (N + 1) / (N + 1/3) seconds for 3 <= N <= 
 with an acceleration that falls linearly to zero, which takes at least 2 v / a = 1 s, and segments are that
 long up to N = 9. From N = 10 on speeding up needs two segments, and one more via-point may lengthen the
 motion.
+
+Full CMA-ES and its populations are backed by the rows "time-optimal" of ``vpsto experiment search``.
 """
 
 import argparse
