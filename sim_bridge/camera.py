@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
 
 _ROUNDING = 1e-9  # instants are multiples of the simulation's step only up to this [s]
 
 
+@documented
 @dataclass(frozen=True)
 class CameraConfig:
     """How well the camera sees."""

@@ -37,7 +37,7 @@ from sim_bridge.pacing import Pacer, Ticker
 from sim_bridge.scene import Scene
 from sim_bridge.simulation import Simulation
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryCommand, TrajectoryRejected
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes.conversions import (
     SIMULATED,
@@ -54,6 +54,7 @@ SLICE = 0.005
 """Simulated time between two looks at the queue [s]."""
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class FrankaDriverConfig(NodeConfig):
     """Parameters of the simulated driver."""

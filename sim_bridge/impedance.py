@@ -7,11 +7,12 @@ import scipy.linalg
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.robot.kinematics import Robot
 
 
+@documented
 @dataclass(frozen=True)
 class ImpedanceConfig:
     """Gains of the impedance controller.

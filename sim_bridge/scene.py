@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.looks import add_looks
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.geometry import Disc, PlanarShape, Rectangle
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.robot.inverse_kinematics import TableMap
@@ -31,6 +31,7 @@ _OBJECT_COLOUR = (0.93, 0.58, 0.16, 1.0)
 _GOAL_COLOUR = (0.16, 0.66, 0.36, 0.45)
 
 
+@documented
 @dataclass(frozen=True)
 class ObjectPlant:
     """The object as it really is.
@@ -82,6 +83,7 @@ class ObjectPlant:
         return feet[_first_of_each(feet)]
 
 
+@documented
 @dataclass(frozen=True)
 class Scene:
     """Everything a simulation starts from.

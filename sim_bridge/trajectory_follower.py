@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory
 
@@ -57,6 +57,7 @@ class TrajectoryRejected(InvalidInputError):
         self.message = message
 
 
+@documented
 @dataclass(frozen=True)
 class FollowerConfig:
     """Tolerances of the rules."""

@@ -1,6 +1,7 @@
 """The package describes itself the same way everywhere, and its rooms import only what they may."""
 
 import ast
+import dataclasses
 import re
 import subprocess
 import sys
@@ -155,3 +156,12 @@ def test_models_are_installed_with_the_package():
     assert files
     assert {str(file.parent) for file in files} == {"vpsto_ros/robot/models"}
     assert '"vpsto_ros.robot": ["models/*.xml"]' in SETUP
+
+
+def test_options_explain_themselves_in_help():
+    from vpsto_ros.optimization.vpsto import VpstoConfig
+
+    text = VpstoConfig.__doc__
+    assert "Options:" in text
+    assert "population: candidates per iteration and start (32; int from 4 to 100000)." in text
+    assert all(f"    {field.name}: " in text for field in dataclasses.fields(VpstoConfig))

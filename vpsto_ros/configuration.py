@@ -7,9 +7,11 @@ written down once.
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 from vpsto_ros.exceptions import ConfigurationError
+
+Config = TypeVar("Config")
 
 
 def option(
@@ -40,6 +42,18 @@ def option(
         "choices": choices,
     }
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def documented(config: type[Config]) -> type[Config]:
+    """Class decorator: add what every option means, its default and its range to the docstring."""
+    lines = ["Options:"]
+    for field in dataclasses.fields(config):  # type: ignore[arg-type]
+        if field.metadata:
+            lines.append(
+                f"    {field.name}: {field.metadata['description']} ({field.default!r}; {allowed(field)})."
+            )
+    config.__doc__ = "\n\n".join([(config.__doc__ or "").rstrip(), "\n".join("    " + line for line in lines)])
+    return config
 
 
 def allowed(field: dataclasses.Field) -> str:

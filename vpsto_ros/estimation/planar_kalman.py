@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes
 from vpsto_ros.estimation.object_state import ObjectState, wrap_angle
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
@@ -19,6 +19,7 @@ from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 _FARTHEST = 1e3  # no object on a table is farther away [m]
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class PlanarKalmanConfig:
     """Options of the filter. Noise densities are standard deviations after one second.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import contact_message, read_state
@@ -25,6 +25,7 @@ from vpsto_ros.planning.workspace import Workspace
 from vpsto_ros.robot.kinematics import JOINT_NAMES, forward_kinematics_batch
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class ContactPlannerNodeConfig(NodeConfig):
     """Parameters of the contact planner."""

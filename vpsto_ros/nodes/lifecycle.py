@@ -23,7 +23,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 
-from vpsto_ros.configuration import option
+from vpsto_ros.configuration import documented, option
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError, VpstoError
 from vpsto_ros.nodes.conversions import TimeBase
 from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Complaints, Pulse, Report
@@ -57,6 +57,7 @@ def latched(depth: int = 1) -> QoSProfile:
     )
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class NodeConfig:
     """What every node can be told."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.scene import ModelConfig
@@ -13,6 +13,7 @@ TRANSPORT = 0.004
 _CYCLE_SHARE, _LEAD_SHARE = 0.9, 0.7  # of the cycle and of the lead that the automatic deadline takes
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class MpcPlannerConfig(NodeConfig):
     """Parameters of the planner."""

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
@@ -15,6 +15,7 @@ from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.workspace import Workspace
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class ShapeConfig:
     """The outline of the object seen from above; its frame is at the centre of its area."""
@@ -42,6 +43,7 @@ class ShapeConfig:
         return getattr(PlanarShape, self.kind)(*self.size)
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
     """What the planners believe about object and tool."""
@@ -86,6 +88,7 @@ def goal_on_table(message: PoseStamped, frame: str, orientation: str, workspace:
     return goal
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class TableConfig:
     """Where a seen object can be; a pose outside is a wrong detection."""

@@ -10,7 +10,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from visualization_msgs.msg import MarkerArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
 from vpsto_ros.exceptions import InvalidInputError
@@ -21,6 +21,7 @@ from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latc
 from vpsto_ros.nodes.scene import TableConfig
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class StateEstimatorConfig(NodeConfig):
     """Parameters of the state estimator."""

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.optimization.terms import (
@@ -38,6 +38,7 @@ from vpsto_ros.trajectory import (
 __all__ = ["CostWeights", "JointSpaceProblem"]
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class CostWeights:
     """Weights of the terms of :class:`JointSpaceProblem`. A violated constraint must outweigh any duration.

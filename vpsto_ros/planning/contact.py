@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.exceptions import InvalidInputError
@@ -20,6 +20,7 @@ from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.pushes import PushRanking, StraightPushes, way_length
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class ContactPlannerConfig:
     """Options of the contact planner."""

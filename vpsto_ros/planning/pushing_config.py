@@ -2,12 +2,13 @@
 
 import dataclasses
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.planning.mpc import OnlineConfig
 from vpsto_ros.planning.workspace import Workspace
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class PushingCosts:
     """Weights and limits of the pushing objective."""
@@ -62,6 +63,7 @@ class PushingCosts:
         validate(self)
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class PushingMpcConfig:
     """Options of the pushing planner."""

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class Workspace:
     """Where the tool and the object may be, base frame [m]."""

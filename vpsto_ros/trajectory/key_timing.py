@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.trajectory.basis import OptimalBasis
 from vpsto_ros.trajectory.limit_constraints import LimitConstraints
@@ -17,6 +17,7 @@ from vpsto_ros.trajectory.timing import MINIMUM_DURATION, Limits, minimal_durati
 from vpsto_ros.trajectory.trajectory import Trajectory
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class KeyTimingConfig:
     """Options of :func:`time_key_positions`.

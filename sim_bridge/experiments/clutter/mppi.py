@@ -16,10 +16,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from vpsto_ros.collision.planar import PlanarWorld
-from vpsto_ros.configuration import option, validate
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.trajectory import Limits
 
 
+@documented
 @dataclasses.dataclass(frozen=True)
 class MppiConfig:
     """Options of :class:`Mppi`.
