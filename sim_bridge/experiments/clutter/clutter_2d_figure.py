@@ -66,7 +66,7 @@ def _way(letters: str) -> str:
     """The obstacles that a path passes above, in words."""
     if letters == "-":
         return "passes below all obstacles"
-    *others, last = letters
+    others, last = letters[:-1], letters[-1]
     return f"passes above {', '.join(others)}{' and ' if others else ''}{last}"
 
 

@@ -94,7 +94,7 @@ def _dress(axes: Any, choice: Choice, top: float) -> None:
     axes.axvspan(marked - 0.45, marked + 0.45, color="0.9", zorder=0)
     names = ["\n".join(textwrap.wrap(value, 18)) for value in choice.values]
     steep = max(map(len, choice.values)) * len(names) > 36
-    turned = {"rotation": 20, "fontsize": 8, "ha": "right", "rotation_mode": "anchor"} if steep else {}
+    turned: dict[str, Any] = {"rotation": 20, "fontsize": 8, "ha": "right", "rotation_mode": "anchor"} if steep else {}
     axes.set_xticks(range(len(names)), names, **{"fontsize": 9, **turned})
     axes.set_xlim(-0.6, len(names) - 0.4)
     axes.set_yscale("symlog", linthresh=LINEAR)
@@ -110,7 +110,8 @@ def _explained(colours: dict[str, str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    dot, cross = {"color": "0.3", "marker": "o", "ms": 4}, {"color": "0.3", "marker": "X", "ms": 7}
+    dot: dict[str, Any] = {"color": "0.3", "marker": "o", "ms": 4}
+    cross: dict[str, Any] = {"color": "0.3", "marker": "X", "ms": 7}
     return [
         *(Line2D([], [], **dot | {"color": colour}, lw=0.8, label=name) for name, colour in colours.items()),
         Line2D([], [], **dot, lw=0, label="median of the runs; bar: its 95 % interval"),

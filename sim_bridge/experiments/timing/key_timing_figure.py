@@ -59,8 +59,9 @@ def _panels(motions: tuple[Trajectory, Trajectory]) -> tuple[Any, dict[str, Any]
             layout="constrained",
         )  # fmt: skip
     share = float(np.clip(2.4 * height / width, 0.8, 2.0))
+    below: list[Any] = [list(row) for row in AXES]
     return plt.subplot_mosaic(
-        [["path", "path"], *(list(row) for row in AXES)], figsize=(10, 5.6 + 2.4 * share),
+        [["path", "path"], *below], figsize=(10, 5.6 + 2.4 * share),
         height_ratios=(share, 1.0, 1.0), layout="constrained",
     )  # fmt: skip
 
