@@ -8,7 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from sim_bridge.experiments.clutter import clutter_2d_mpc, moving_discs, mpc_runs, mppi
+from sim_bridge import cli
+from sim_bridge.experiments.clutter import clutter_2d_mpc, moving_discs, mpc_runs, mppi, mppi_tuning
 from sim_bridge.experiments.clutter.moving_discs import BouncingDisc, random_discs, stays
 from sim_bridge.experiments.clutter.mpc_runs import PERIOD, Task, VpstoController, run_task
 from sim_bridge.experiments.clutter.world import GOAL, LIMITS, STARTS
@@ -203,6 +204,49 @@ def test_the_verdict_fails_when_anything_falls_short(finished, world, key, value
     (worse if world == "static" else worse["moving"])[key] = value
     (text,) = clutter_2d_mpc.shortcomings(worse)
     assert text.startswith(world)
+
+
+def tuned(times, open_times=(2.0,) * 8):
+    starts = zip(mppi_tuning.STARTS, (times, open_times), strict=True)
+    return {s: {"successes": len(t) - t.count(None), "times_s": list(t)} for s, t in starts}
+
+
+@pytest.mark.parametrize(
+    ("other", "better"),
+    [
+        (tuned([5.0 + 0.1 * k for k in range(8)]), True),
+        (tuned([5.9 + 0.1 * k for k in range(8)]), False),  # by luck
+        (tuned([5.0] * 7 + [None]), False),  # quicker, but not as sure
+        (tuned([7.0] * 8, [1.8 + 0.01 * k for k in range(8)]), True),
+        (tuned([7.0] * 8), False),
+    ],
+)
+def test_a_setting_is_better_when_luck_does_not_explain_it(other, better):
+    chosen = tuned([6.0 + 0.1 * k for k in range(8)])
+    figures = {(1.5, mppi_tuning.CHOSEN): chosen, (1.5, "noise 9"): other}
+    assert mppi_tuning.clearly_better(figures) == ["horizon 1.5 s is better with noise 9"] * better
+    sure = {(1.5, mppi_tuning.CHOSEN): tuned([None] * 8), (1.5, "noise 9"): tuned([9.0] * 8)}
+    assert mppi_tuning.clearly_better(sure)
+
+
+def test_tuning_writes_what_other_settings_do(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(mppi_tuning, "STARTS", ("open",))
+    monkeypatch.setattr(mppi_tuning, "LONGEST", 0.5)
+    chosen = {1.0: dataclasses.replace(clutter_2d_mpc.MPPI[1.0], points=500)}
+    monkeypatch.setattr(clutter_2d_mpc, "MPPI", chosen)
+    assert cli.main(
+        ["experiment", "clutter_2d_mpc", "--tune", "--runs", "1", "--jobs", "1", "--out", str(tmp_path)]
+    ) == 0  # fmt: skip
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["seed"] == 1000, "no seed that a reported figure uses"
+    names = [each["setting"] for each in summary["settings"]]
+    assert names[0] == mppi_tuning.CHOSEN and "accelerations" in names and len(set(names)) == len(names) > 7
+    assert capsys.readouterr().out.strip().splitlines()[-1].startswith("verdict: passed")
+
+
+def test_no_task_is_run_twice():
+    tasks = [task for group in clutter_2d_mpc._tasks(range(3), sweep=True).values() for task in group]
+    assert len(dict.fromkeys(tasks)) == len(tasks) - 2 * 3, "the short horizon belongs to two groups"
 
 
 def test_baseline_options_are_checked():
