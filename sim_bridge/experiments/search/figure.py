@@ -94,8 +94,10 @@ def _dress(axes: Any, choice: Choice, top: float) -> None:
     axes.axvspan(marked - 0.45, marked + 0.45, color="0.9", zorder=0)
     names = ["\n".join(textwrap.wrap(value, 18)) for value in choice.values]
     steep = max(map(len, choice.values)) * len(names) > 36
-    turned: dict[str, Any] = {"rotation": 20, "fontsize": 8, "ha": "right", "rotation_mode": "anchor"} if steep else {}
-    axes.set_xticks(range(len(names)), names, **{"fontsize": 9, **turned})
+    style: dict[str, Any] = {"fontsize": 9}
+    if steep:
+        style = {"fontsize": 8, "rotation": 20, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(range(len(names)), names, **style)
     axes.set_xlim(-0.6, len(names) - 0.4)
     axes.set_yscale("symlog", linthresh=LINEAR)
     ticks = [0.0, *10.0 ** np.arange(np.log10(LINEAR), np.log10(top) + 0.5)]
