@@ -26,8 +26,8 @@ class VpstoConfig:
     """Options of the search.
 
     The defaults suit few iterations, as when replanning. With a hundred iterations or more, and up to some
-    sixty variables, ``strategy = "cma"`` is the better choice: it takes up to three times as long an iteration
-    and comes closer to the optimum of time-optimal motions and of few via-points among obstacles
+    sixty variables, ``strategy = "cma"`` is the better choice: an iteration takes up to three times as long
+    and it comes closer to the optimum of time-optimal motions and of few via-points among obstacles
     (``vpsto experiment search``, rows "covariance adaptation").
 
     Raises:
