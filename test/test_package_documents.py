@@ -61,3 +61,10 @@ def test_the_python_code_runs_as_printed(tmp_path):
         run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
         assert run.returncode == 0, run.stderr
         assert len(run.stdout.splitlines()) == code.count("print(")
+
+
+@pytest.mark.parametrize("document", [ROOT / "README.md", *sorted((ROOT / "doc").glob("*.md"))], ids=str)
+def test_every_file_linked_is_there(document):
+    links = re.findall(r"\]\((?!https?:|#)([^)\s]+)\)", document.read_text())
+    missing = [link for link in links if not (document.parent / link).exists()]
+    assert not missing

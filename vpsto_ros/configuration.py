@@ -46,13 +46,13 @@ def option(
 
 def documented(config: type[Config]) -> type[Config]:
     """Class decorator: add what every option means, its default and its range to the docstring."""
-    lines = ["Options:"]
+    lines = ["    Options:"]
     for field in dataclasses.fields(config):  # type: ignore[arg-type]
         if field.metadata:
             lines.append(
-                f"    {field.name}: {field.metadata['description']} ({field.default!r}; {allowed(field)})."
+                f"        {field.name}: {field.metadata['description']} ({field.default!r}; {allowed(field)})."
             )
-    config.__doc__ = "\n\n".join([(config.__doc__ or "").rstrip(), "\n".join("    " + line for line in lines)])
+    config.__doc__ = "\n\n".join([(config.__doc__ or "").rstrip(), "\n".join(lines)])
     return config
 
 
