@@ -49,9 +49,8 @@ def documented(config: type[Config]) -> type[Config]:
     lines = ["    Options:"]
     for field in dataclasses.fields(config):  # type: ignore[arg-type]
         if field.metadata:
-            lines.append(
-                f"        {field.name}: {field.metadata['description']} ({field.default!r}; {allowed(field)})."
-            )
+            description, limits = field.metadata["description"], allowed(field)
+            lines.append(f"        {field.name}: {description} ({field.default!r}; {limits}).")
     config.__doc__ = "\n\n".join([(config.__doc__ or "").rstrip(), "\n".join(lines)])
     return config
 
