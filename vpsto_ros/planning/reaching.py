@@ -29,6 +29,9 @@ _LARGEST_DRAW = 8  # postures drawn for one that is kept
 class ReachConfig:
     """Options of :func:`plan_reach`; ``vpsto experiment search`` varies them in its table of reaching.
 
+    Four starts are there for success. Fewer starts with more iterations give motions that are about five
+    percent shorter, and missed one of sixty cells (seeds 1000 to 1059) in which four starts missed none.
+
     Raises:
         ConfigurationError: a value is out of range.
     """
