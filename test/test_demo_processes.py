@@ -1,4 +1,5 @@
 import signal
+import subprocess
 import sys
 import time
 
@@ -63,3 +64,18 @@ def test_a_process_that_ends_is_noticed_with_its_last_words(tmp_path):
         assert group.ended() == ["one"]
         assert group.last_lines("one") == "hello"
     assert group.exit_codes == {"one": 3}
+
+
+def test_a_signal_during_a_start_leaves_no_child_behind(tmp_path, monkeypatch):
+    started = []
+    popen = subprocess.Popen
+
+    def interrupted(*arguments, **options):
+        started.append(popen(*arguments, **options))
+        signal.raise_signal(signal.SIGINT)
+        return started[-1]
+
+    monkeypatch.setattr("sim_bridge.demo.processes.subprocess.Popen", interrupted)
+    with pytest.raises(KeyboardInterrupt), ProcessGroup(tmp_path, {}) as group:
+        group.start("sleeper", [sys.executable, "-c", "import time; time.sleep(60)"])
+    assert started[0].poll() is not None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 
@@ -26,6 +28,28 @@ def private_network() -> dict[str, str]:
     }
     os.environ.update(environment)
     return environment
+
+
+@contextlib.contextmanager
+def signals_wait() -> Iterator[None]:
+    """Let SIGINT and SIGTERM wait until the block is left; only the main thread gets any."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def note(number: int, _frame: object) -> None:
+        caught.append(number)
+
+    before = {number: signal.signal(number, note) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for waiting in caught:
+            signal.raise_signal(waiting)
 
 
 class ProcessGroup:
@@ -49,7 +73,8 @@ class ProcessGroup:
 
     def start(self, name: str, command: Sequence[str]) -> None:
         """Start a process under a name."""
-        with open(self.log_path(name), "wb") as log:
+        # A signal between the start of a child and its being noted down would leave the child behind.
+        with open(self.log_path(name), "wb") as log, signals_wait():
             # In a session of its own: Ctrl-C in the terminal reaches only the parent, which stops them all.
             self._processes[name] = subprocess.Popen(
                 command,
