@@ -10,28 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
-from vpsto_ros.robot import kinematics as fr3
-from vpsto_ros.robot.kinematics import Robot, forward_kinematics_batch, tip_velocity_batch
-from vpsto_ros.robot.radial_arm import (
-    FOREARM,
-    STRAIGHT_ELBOW,
-    UPPER_ARM,
-    RadialArm,
-    plane_to_joints,
-    radial_arms,
-)
-
-_STRETCH_MARGIN = 0.3  # the elbow stays bent by at least this beyond the straight, singular arm [rad]
+from vpsto_ros.robot.kinematics import TOOL_LENGTH, Robot, forward_kinematics_batch, tip_velocity_batch
+from vpsto_ros.robot.radial_arm import RadialArm
+from vpsto_ros.robot.upright_arm import UprightArm
 
 
 class TableMap:
-    """The tool plane above the table, mapped to joint positions in closed form.
+    """The plane of the rod above the table, a :class:`vpsto_ros.robot.tool_plane.ToolPlane` for (x, y).
 
     Attributes:
+        robot: the arm.
+        dof: number of plane coordinates.
         height: height of the tip above the table [m].
         radius_range: (r_min, r_max) [m], distances of the tip from the base axis for which the joint
             position limits hold and the elbow stays clear of the singular, straight arm.
     """
+
+    dof = 2
 
     def __init__(
         self, robot: Robot, height: float = 0.02, *, tool_yaw: float = np.pi / 4, margin: float = 0.02
@@ -49,31 +44,18 @@ class TableMap:
             InvalidInputError: the arm has another geometry, or no radius is within its limits at this height.
         """
         self.height = float(height)
-        self._robot = robot
+        self.robot = robot
         self._tool_yaw = float(tool_yaw)
-        self._wrist_height = self.height + fr3.TOOL_LENGTH + fr3.FLANGE_OFFSET - fr3.SHOULDER_HEIGHT
-        self.radius_range = self._find_radius_range(margin)
+        lower, upper = robot.position_range
+        self._arm = UprightArm(lower, upper, self.height, TOOL_LENGTH, margin=margin)
+        if not lower[6] <= self._tool_yaw <= upper[6]:
+            raise InvalidInputError(f"tool_yaw = {tool_yaw} rad is beyond the limits of joint 7")
+        self.radius_range = self._arm.radius_range
         probe = np.array([0.5 * sum(self.radius_range), 0.0])
         if np.abs(robot.forward(self.joints(probe[None])[0])[0] - [*probe, self.height]).max() > 1e-9:
             raise InvalidInputError(
                 "TableMap knows the geometry of the FR3 with the pushing rod only; this robot differs"
             )
-
-    def _find_radius_range(self, margin: float) -> tuple[float, float]:
-        lower, upper = self._robot.position_range
-        radii = np.linspace(fr3.WRIST_OFFSET + 1e-3, fr3.WRIST_OFFSET + UPPER_ARM + FOREARM, 7201)
-        reach = np.hypot(radii - fr3.WRIST_OFFSET, self._wrist_height)
-        radii = radii[(reach < UPPER_ARM + FOREARM - 1e-6) & (reach > abs(FOREARM - UPPER_ARM) + 1e-6)]
-        angles = self.radial(radii).angle
-        index = [1, 3, 5]
-        inside = (angles >= lower[index] + margin) & (angles <= upper[index] - margin)
-        bent = angles[:, 1] < STRAIGHT_ELBOW - _STRETCH_MARGIN
-        good = np.flatnonzero(inside.all(axis=1) & bent)
-        if len(good) == 0 or not lower[6] <= self._tool_yaw <= upper[6]:
-            raise InvalidInputError(
-                f"no posture within the joint limits holds the upright tool at height {self.height} m"
-            )
-        return float(radii[good[0]]), float(radii[good[-1]])
 
     def radial(self, radii: ArrayLike) -> RadialArm:
         """Joints 2, 4 and 6 [rad] and their derivatives by the radius [rad/m, rad/m²] for radii (K,) [m].
@@ -81,16 +63,11 @@ class TableMap:
         Raises:
             InfeasibleError: a radius is out of reach.
         """
-        radii = np.ascontiguousarray(radii, dtype=float)
-        out, bad = radial_arms(radii, self._wrist_height)
-        if bad >= 0:
-            raise InfeasibleError(self._reach_message(radii[bad]))
-        return RadialArm(out[:, 0], out[:, 1], out[:, 2])
+        return self._arm.radial(radii)
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether plane points (..., 2) [m] lie in radius_range, at least margin [m] from its ends."""
-        radii = np.linalg.norm(np.asarray(points, dtype=float), axis=-1)
-        return (radii >= self.radius_range[0] + margin) & (radii <= self.radius_range[1] - margin)
+        return self._arm.reaches(points, margin)
 
     def joints(self, points: ArrayLike) -> NDArray[np.float64]:
         """Joint positions (K, 7) [rad] that put the tip at plane points (K, 2) [m].
@@ -134,31 +111,31 @@ class TableMap:
 
     def tool(self, q: ArrayLike) -> NDArray[np.float64]:
         """Plane points (..., 2) [m] of the tip for joint positions (..., 7) [rad], upright or not."""
-        q = np.asarray(q, dtype=float)
-        return forward_kinematics_batch(q.reshape(-1, 7))[:, :2].reshape(*q.shape[:-1], 2)
+        return self.tips(q)[..., 0, :2]
 
     def tool_velocity(self, q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
         """Velocities (..., 2) [m/s] of the tip in the plane for joint positions and velocities (..., 7)."""
+        return self.tip_velocities(q, qd)[..., 0, :2]
+
+    def tips(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Positions (..., 1, 3) [m] of the tip in the base frame for joint positions (..., 7) [rad]."""
+        q = np.asarray(q, dtype=float)
+        return forward_kinematics_batch(q.reshape(-1, 7)).reshape(*q.shape[:-1], 1, 3)
+
+    def tip_velocities(self, q: ArrayLike, qd: ArrayLike) -> NDArray[np.float64]:
+        """Velocities (..., 1, 3) [m/s] of the tip for joint positions and velocities (..., 7)."""
         q, qd = np.asarray(q, dtype=float), np.asarray(qd, dtype=float)
         velocity = tip_velocity_batch(q.reshape(-1, 7), qd.reshape(-1, 7))
-        return velocity[:, :2].reshape(*q.shape[:-1], 2)
+        return velocity.reshape(*q.shape[:-1], 1, 3)
+
+    def tool_heights(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Heights (..., 1) [m] of the tip above the table for joint positions (..., 7) [rad]."""
+        return self.tips(q)[..., 2]
 
     def _motion(self, points, velocities, accelerations, orders):
         if not points.shape == velocities.shape == accelerations.shape:
             raise InvalidInputError("points, velocities and accelerations must have equal shapes")
-        q, qd, qdd, bad = plane_to_joints(
-            points, velocities, accelerations, self._wrist_height, self._tool_yaw, orders
-        )
-        if bad >= 0:
-            raise InfeasibleError(self._reach_message(float(np.linalg.norm(points[bad]))))
-        return q, qd, qdd
-
-    def _reach_message(self, radius: float) -> str:
-        usable = getattr(self, "radius_range", None)
-        hint = f"; usable radii: {usable[0]:.3f} to {usable[1]:.3f} m" if usable else ""
-        return (
-            f"the upright tool cannot reach {radius:.3f} m from the base axis at height {self.height} m{hint}"
-        )
+        return self._arm.motion(points, velocities, accelerations, orders=orders, tool_yaw=self._tool_yaw)
 
 
 def _rows(values: ArrayLike, name: str) -> NDArray[np.float64]:

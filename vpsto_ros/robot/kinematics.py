@@ -1,6 +1,7 @@
-"""The Franka Research 3 with a pushing rod: limits, dynamics by Pinocchio, own fast kinematics.
+"""The Franka Research 3 and its pushing tools: limits, dynamics by Pinocchio, fast kinematics of the rod.
 
-One robot description (``models/fr3_pusher.xml``) is read by Pinocchio here and by the simulator elsewhere.
+A robot description (such as ``models/fr3_pusher.xml``) is read by Pinocchio here and by the simulator
+elsewhere.
 What the planners call thousands of times per replan, the position of the tool tip, is compiled here from
 the modified DH table instead.
 """
@@ -16,7 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.trajectory.timing import Limits
 
-MODEL_PATH = Path(__file__).parent / "models" / "fr3_pusher.xml"
+_MODELS = Path(__file__).parent / "models"
+MODEL_PATH = _MODELS / "fr3_pusher.xml"
+HAND_MODEL_PATH = _MODELS / "fr3_hand_pusher.xml"
+BIMANUAL_MODEL_PATH = _MODELS / "fr3_bimanual.xml"
+TIP_NAMES = ("left_tool_tip", "right_tool_tip")  # frames of the two balls
 JOINT_NAMES = tuple(f"fr3_joint{i}" for i in range(1, 8))
 
 # Limits of the FR3 that its MJCF cannot hold (Pinocchio leaves the velocity limit of an MJCF infinite)
@@ -151,11 +156,7 @@ class Robot:
         self._pin = pinocchio
         self._model = model
         self._data = model.createData()
-        if not model.existFrame(tip):
-            raise ConfigurationError(
-                f"the robot description has no frame '{tip}'; it has: {_frame_names(model)}"
-            )
-        self._tip = model.getFrameId(tip)
+        self._tip = _frame(model, tip)
         self.joint_names: tuple[str, ...] = tuple(list(model.names)[1:])
         self.torque_limits = _per_joint(model.effortLimit, model.nv, "effort limits")
         self.torque_rate_limits = _per_joint(torque_rate, model.nv, "torque_rate")
@@ -206,16 +207,36 @@ class Robot:
         """Number of joints."""
         return self._model.nv
 
-    def forward(self, q: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Position (3,) [m] and rotation matrix (3, 3) of the tool tip for joint positions q (n,) [rad]."""
+    def forward(
+        self, q: ArrayLike, tip: str | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position (3,) [m] and rotation matrix (3, 3) of the tool tip for joint positions q (n,) [rad].
+
+        Args:
+            q: joint positions.
+            tip: name of another frame to look at instead, such as the second tool's.
+
+        Raises:
+            ConfigurationError: there is no such frame.
+        """
+        frame = self._tip if tip is None else _frame(self._model, tip)
         self._pin.framesForwardKinematics(self._model, self._data, self._vector(q, "q"))
-        placement = self._data.oMf[self._tip]
+        placement = self._data.oMf[frame]
         return placement.translation.copy(), placement.rotation.copy()
 
-    def jacobian(self, q: ArrayLike) -> NDArray[np.float64]:
-        """Jacobian (6, n) of the tool tip at q (n,) [rad]: linear, then angular, in axes of the base."""
-        frame = self._pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        return self._pin.computeFrameJacobian(self._model, self._data, self._vector(q, "q"), self._tip, frame)
+    def jacobian(self, q: ArrayLike, tip: str | None = None) -> NDArray[np.float64]:
+        """Jacobian (6, n) of the tool tip, or of another frame: linear, then angular, in axes of the base.
+
+        Args:
+            q: joint positions [rad], shape (n,).
+            tip: name of another frame to look at instead, such as the second tool's.
+
+        Raises:
+            ConfigurationError: there is no such frame.
+        """
+        frame = self._tip if tip is None else _frame(self._model, tip)
+        axes = self._pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        return self._pin.computeFrameJacobian(self._model, self._data, self._vector(q, "q"), frame, axes)
 
     def inverse_dynamics(self, q: NDArray, qd: NDArray, qdd: NDArray) -> NDArray[np.float64]:
         """Torques M(q) qdd + C(q, qd) qd + g(q) [Nm], shape (n,); eq. (2.1) without external forces.
@@ -244,11 +265,32 @@ def _per_joint(values: ArrayLike, dof: int, name: str) -> NDArray[np.float64]:
     return vector
 
 
-def _frame_names(model) -> str:
-    return ", ".join(frame.name for frame in model.frames)
+def _frame(model, name: str) -> int:
+    if not model.existFrame(name):
+        names = ", ".join(frame.name for frame in model.frames)
+        raise ConfigurationError(f"the robot description has no frame '{name}'; it has: {names}")
+    return model.getFrameId(name)
 
 
 @lru_cache(maxsize=1)
 def fr3_pusher() -> Robot:
     """The Franka Research 3 with the pushing rod, read once and shared (but not by threads)."""
     return Robot.from_mjcf(MODEL_PATH)
+
+
+@lru_cache(maxsize=1)
+def fr3_hand_pusher() -> Robot:
+    """The Franka Research 3 with a block like its hand as a pusher, read once and shared."""
+    return Robot.from_mjcf(HAND_MODEL_PATH)
+
+
+@lru_cache(maxsize=1)
+def fr3_bimanual() -> Robot:
+    """Two Franka Research 3, each with a ball on a crank, read once and shared; see TIP_NAMES."""
+    return Robot.from_mjcf(
+        BIMANUAL_MODEL_PATH,
+        velocity=2 * VELOCITY_LIMITS,
+        acceleration=2 * ACCELERATION_LIMITS,
+        torque_rate=2 * TORQUE_RATE_LIMITS,
+        tip=TIP_NAMES[0],
+    )
