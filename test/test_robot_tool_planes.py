@@ -1,4 +1,4 @@
-"""The two arms and the hand: true copies of one arm, tools where Pinocchio and MuJoCo see them, exact maps."""
+"""The two arms and the hand: true copies of one arm, tools as Pinocchio and MuJoCo see them, exact maps."""
 
 import xml.etree.ElementTree
 
