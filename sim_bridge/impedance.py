@@ -20,18 +20,26 @@ class ImpedanceConfig:
     The stiffness lies between what FR3 controllers use in compliant tasks and the arm's own joint
     impedance; a push of 6 N at the tip then costs at most 3 mm on the table. Joint 7 turns a round rod
     about its axis and has next to no inertia: soft, so that its natural frequency stays far below the
-    control rate.
+    control rate. A tool that is not round has more inertia, and pushes with a lever: stiffer.
     """
 
     stiffness: tuple[float, ...] = option(
         (2000.0, 2000.0, 2000.0, 2000.0, 600.0, 450.0, 25.0),
-        "joint stiffness", unit="Nm/rad", minimum=0.0, maximum=5000.0,
+        "joint stiffness of an arm", unit="Nm/rad", minimum=0.0, maximum=5000.0,
     )  # fmt: skip
+    offset_stiffness: float = option(
+        120.0, "stiffness of joint 7 under other tools", unit="Nm/rad", minimum=0.0, maximum=500.0
+    )
     damping_ratio: float = option(1.0, "damping relative to critical", minimum=0.0, maximum=1.5)
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         validate(self)
+
+    def for_arms(self, arms: int, round_tool: bool = True) -> NDArray[np.float64]:
+        """Stiffness of all joints of some arms [Nm/rad], shape (7 arms,)."""
+        last = self.stiffness[-1] if round_tool else self.offset_stiffness
+        return np.tile([*self.stiffness[:-1], last], arms)
 
 
 class ImpedanceController:
@@ -42,10 +50,10 @@ class ImpedanceController:
     posture, such that every mode of M and K has the wanted damping ratio there (double diagonalization).
 
     Attributes:
-        saturated: control cycles in which each joint's torque was cut to its limit, shape (7,).
-        rate_limited: likewise for the torque rate, shape (7,).
+        saturated: control cycles in which each joint's torque was cut to its limit, shape (n,).
+        rate_limited: likewise for the torque rate, shape (n,).
         demand: what the last cycle asked for before it was cut, as shares of the torque and torque-rate
-            limits, shape (2, 7).
+            limits, shape (2, n).
     """
 
     def __init__(
@@ -54,14 +62,16 @@ class ImpedanceController:
         nominal_posture: ArrayLike,
         config: ImpedanceConfig | None = None,
         *,
+        round_tool: bool = True,
         period: float = 0.001,
     ):
         """Design the gains.
 
         Args:
-            robot: model of the arm.
-            nominal_posture: joint positions at which the damping is designed [rad], shape (7,).
+            robot: model of the arm, or of several arms.
+            nominal_posture: joint positions at which the damping is designed [rad], shape (n,).
             config: gains.
+            round_tool: whether joint 7 turns a round tool about its own axis.
             period: control period [s].
 
         Raises:
@@ -71,15 +81,16 @@ class ImpedanceController:
             raise InvalidInputError(f"period must be positive, got {period}")
         config = config or ImpedanceConfig()
         self._robot = robot
-        self._stiffness = np.array(config.stiffness)
+        n = robot.dof
+        self._stiffness = config.for_arms(n // 7, round_tool)
         self._damping = critical_damping(
             robot.mass_matrix(nominal_posture), self._stiffness, config.damping_ratio
         )
         self._limit = np.array(robot.torque_limits)
         self._step = np.array(robot.torque_rate_limits) * period
-        self._torque = np.zeros(7)
-        self._counts = np.zeros((2, 7), dtype=np.int64)
-        self.demand = np.zeros((2, 7))
+        self._torque = np.zeros(n)
+        self._counts = np.zeros((2, n), dtype=np.int64)
+        self.demand = np.zeros((2, n))
         self._fresh = True
 
     @property
@@ -99,14 +110,14 @@ class ImpedanceController:
     def torque(
         self, q: NDArray, qd: NDArray, q_des: NDArray, qd_des: NDArray, qdd_des: NDArray
     ) -> NDArray[np.float64]:
-        """Torques [Nm] for this cycle, shape (7,); the array is reused by the next call.
+        """Torques [Nm] for this cycle, shape (n,); the array is reused by the next call.
 
         Args:
-            q: measured joint positions [rad], shape (7,).
-            qd: measured joint velocities [rad/s], shape (7,).
-            q_des: desired positions [rad], shape (7,).
-            qd_des: desired velocities [rad/s], shape (7,).
-            qdd_des: desired accelerations [rad/s²], shape (7,).
+            q: measured joint positions [rad], shape (n,).
+            qd: measured joint velocities [rad/s], shape (n,).
+            q_des: desired positions [rad], shape (n,).
+            qd_des: desired velocities [rad/s], shape (n,).
+            qdd_des: desired accelerations [rad/s²], shape (n,).
         """
         model_torque = self._robot.inverse_dynamics(q, qd, qdd_des)
         _control_law(
@@ -132,9 +143,9 @@ def _control_law(
     model_torque, q, qd, q_des, qd_des, stiffness, damping, limit, step, fresh, torque, counts, demand
 ):
     """Add stiffness and damping to the model's torque; cut to limits; write the torque in place."""
-    for i in range(7):
+    for i in range(q.shape[0]):
         u = model_torque[i] - stiffness[i] * (q[i] - q_des[i])
-        for j in range(7):
+        for j in range(q.shape[0]):
             u -= damping[i, j] * (qd[j] - qd_des[j])
         demand[0, i] = abs(u) / limit[i]
         if demand[0, i] > 1.0:

@@ -64,12 +64,12 @@ class LimitMonitor:
         """Take in one control cycle.
 
         Args:
-            q_des: reference position [rad], shape (7,).
-            qd_des: reference velocity [rad/s], shape (7,).
-            qdd_des: reference acceleration [rad/s²], shape (7,).
-            q: measured position [rad], shape (7,).
-            qd: measured velocity [rad/s], shape (7,).
-            demand: shares of the torque and torque-rate limits asked for, shape (2, 7).
+            q_des: reference position [rad], shape (n,).
+            qd_des: reference velocity [rad/s], shape (n,).
+            qdd_des: reference acceleration [rad/s²], shape (n,).
+            q: measured position [rad], shape (n,).
+            qd: measured velocity [rad/s], shape (n,).
+            demand: shares of the torque and torque-rate limits asked for, shape (2, n).
         """
         self.instants += 1
         _observe(self._bounds, q_des, qd_des, qdd_des, q, qd, demand, self._counts, self._worst, self._joints)
@@ -96,9 +96,9 @@ class LimitMonitor:
 
 @njit(cache=True, nogil=True)
 def _observe(bounds, q_des, qd_des, qdd_des, q, qd, demand, counts, worst, joints):
-    for kind in range(7):
+    for kind in range(counts.shape[0]):
         most, joint = 0.0, 0
-        for i in range(7):
+        for i in range(q.shape[0]):
             if kind == 0:
                 share = abs(q_des[i] - bounds[0, i]) / bounds[1, i]
             elif kind == 1:

@@ -1,4 +1,4 @@
-"""What is simulated: the arm with its rod, a table, one object that slides on it, and how all of that looks.
+"""What is simulated: the robot, a table, one object that slides on it, and how all of that looks.
 
 The planners never see this file's numbers: they are the plant.
 """
@@ -11,76 +11,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.looks import add_looks
+from sim_bridge.object_plant import ObjectPlant, solids
+from sim_bridge.robots import CUBE, KINDS, LINK, ROD, RobotKind, robot_spec
 from vpsto_ros.configuration import documented, option, validate
-from vpsto_ros.contact.geometry import Disc, PlanarShape, Rectangle
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.robot.inverse_kinematics import TableMap
-from vpsto_ros.robot.kinematics import MODEL_PATH, TOOL_LENGTH, fr3_pusher
+from vpsto_ros.robot.tool_plane import ToolPlane
 
 TIMESTEP = 0.001
-TOOL_RADIUS = 0.015
+GRAVITY = 9.81
+CUBE_SIDE = 0.015
+"""Of the small wooden cubes that may lie in the way [m]."""
 
-# Friction and damping of the real joints that is left after the maker's compensation; no controller here
-# knows them.
-_JOINT_FRICTION = (0.3, 0.3, 0.3, 0.3, 0.15, 0.1, 0.1)  # [Nm]
-_JOINT_DAMPING = (0.5, 0.5, 0.5, 0.5, 0.2, 0.1, 0.005)  # [Nm s/rad]
-
+_CUBE_DENSITY = 700.0  # 2.4 g each
+_CUBE_FRICTION = 0.4
 _FOOT_RADIUS = 0.004
-_ROBOT, _ROD = 1, 4  # collision bits; the object only meets what asks for it by an explicit pair or by these
 _OBJECT_COLOUR = (0.93, 0.58, 0.16, 1.0)
 _GOAL_COLOUR = (0.16, 0.66, 0.36, 0.45)
+_CUBE_COLOUR = (0.62, 0.44, 0.26, 1.0)
 
 
 @documented
 @dataclass(frozen=True)
-class ObjectPlant:
-    """The object as it really is.
+class HandStart:
+    """Where the hand starts."""
 
-    Args:
-        shape: outline seen from above, in the object frame.
-        height: height [m].
-        mass: mass [kg].
-        table_friction: friction coefficient between object and table.
-        tool_friction: friction coefficient between object and rod.
-        com_offset: centre of mass relative to the centre of the outline's area [m], object frame.
-        support: where the object touches the table: "corners" or "spread" evenly.
-
-    Raises:
-        ConfigurationError: naming the field, its value and what is allowed.
-    """
-
-    shape: PlanarShape = field(default_factory=lambda: PlanarShape.box(0.12, 0.12))
-    height: float = option(0.06, "height of the object", unit="m", minimum=0.03, maximum=0.3)
-    mass: float = option(0.5, "mass of the object", unit="kg", minimum=0.01, maximum=10.0)
-    table_friction: float = option(0.35, "friction coefficient on the table", minimum=0.01, maximum=2.0)
-    tool_friction: float = option(0.25, "friction coefficient against the rod", minimum=0.0, maximum=2.0)
-    com_offset: tuple[float, float] = option(
-        (0.0, 0.0), "centre of mass relative to the centre of area", unit="m", minimum=-0.1, maximum=0.1
+    start: tuple[float, float, float] = option(
+        (0.36, -0.22, 1.5708), "start of the hand (x, y, yaw)", unit="m, rad", minimum=-4.0, maximum=4.0
     )
-    support: str = option("corners", "where the object touches the table", choices=("corners", "spread"))
+    height: float = option(
+        0.05, "height of the hand's centre above the table", unit="m", minimum=0.032, maximum=0.2
+    )
 
     def __post_init__(self) -> None:
-        """Check the ranges, and that the centre of mass is above the supported area."""
+        """Check the ranges."""
         validate(self)
-        com = self.shape.centroid() + self.com_offset
-        if not _inside_hull(self.feet(), com):
-            raise ConfigurationError(
-                f"ObjectPlant.com_offset = {self.com_offset} puts the centre of mass beyond the feet; the "
-                "object would tip over"
-            )
 
-    def feet(self) -> NDArray[np.float64]:
-        """Where the object touches the table, shape (F, 2) [m], object frame.
 
-        Corners: the corners of the outline (four points on the rim of a disc). Spread: the centre of each
-        primitive and four points around it, such that equal loads have the second moments of an evenly
-        spread pressure.
-        """
-        points = [foot for p in self.shape.primitives for foot in _primitive_feet(p, self.support)]
-        feet = np.array(points)
-        if self.support == "corners" and len(self.shape.primitives) > 1:
-            feet = feet[self.shape.signed_distance(feet) > -1e-6]
-        return feet[_first_of_each(feet)]
+@documented
+@dataclass(frozen=True)
+class BallsStart:
+    """Where the two balls start."""
+
+    start: tuple[float, float, float, float] = option(
+        (0.38, 0.12, 0.38, -0.12), "start of the balls (left x, y, right x, y)", unit="m",
+        minimum=-1.0, maximum=1.0,
+    )  # fmt: skip
+    height: float = option(
+        0.035, "height of the balls' centres above the table", unit="m", minimum=0.032, maximum=0.2
+    )
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        validate(self)
 
 
 @documented
@@ -90,18 +72,26 @@ class Scene:
 
     Args:
         plant: the object.
+        robot: which robot: one arm with a rod, one arm with a hand, or two arms with balls.
         object_pose: where its frame starts, (x, y, yaw) [m, rad].
-        start_joints: joint positions at the start [rad], or None: rod upright at start_tool.
+        start_joints: joint positions at the start [rad], or None: tools upright at start_tool, hand.start or
+            balls.start.
         start_tool: where the rod starts on the table if start_joints is None [m].
         tool_height: height of the rod's tip above the table [m].
+        hand: start and height of the hand.
+        balls: start and height of the balls.
         joint_friction: scale of the joints' dry friction; 1 is 0.1 to 0.3 Nm.
         joint_damping: scale of the joints' viscous friction.
+        slope: angles by which the table, and the robot on it, is tilted down towards x and y [rad]; the
+            controller takes it for level.
+        cubes: where small loose cubes of wood lie on the table, pairs (x, y) [m].
 
     Raises:
         ConfigurationError: naming the field, its value and what is allowed.
     """
 
     plant: ObjectPlant = field(default_factory=ObjectPlant)
+    robot: str = option("rod", "robot with its tools", choices=tuple(KINDS))
     object_pose: tuple[float, float, float] = option(
         (0.5, 0.0, 0.0), "start pose of the object (x, y, yaw)", unit="m, rad", minimum=-10.0, maximum=10.0
     )
@@ -112,60 +102,96 @@ class Scene:
     tool_height: float = option(
         0.02, "height of the rod's tip above the table", unit="m", minimum=0.002, maximum=0.2
     )
+    hand: HandStart = field(default_factory=HandStart)
+    balls: BallsStart = field(default_factory=BallsStart)
     joint_friction: float = option(1.0, "scale of the dry friction of the joints", minimum=0.0, maximum=10.0)
     joint_damping: float = option(
         1.0, "scale of the viscous friction of the joints", minimum=0.0, maximum=10.0
     )
 
+    slope: tuple[float, float] = option(
+        (0.0, 0.0), "tilt of the table down towards x and y", unit="rad", minimum=-0.1, maximum=0.1
+    )
+    cubes: tuple[tuple[float, float], ...] = ()
+
     def __post_init__(self) -> None:
         """Check the ranges."""
         validate(self)
+        cubes = np.array(self.cubes, dtype=float)
+        if cubes.size and (cubes.ndim != 2 or cubes.shape[1] != 2 or not np.isfinite(cubes).all()):
+            raise ConfigurationError(f"Scene.cubes = {self.cubes} must be pairs (x, y) of finite numbers")
 
-    def joints(self) -> NDArray[np.float64]:
-        """Joint positions at the start [rad], shape (7,).
+    @property
+    def kind(self) -> RobotKind:
+        """The robot."""
+        return KINDS[self.robot]
+
+    @property
+    def height(self) -> float:
+        """Height of the tips of the robot's tools above the table [m]."""
+        return {"rod": self.tool_height, "hand": self.hand.height, "two_balls": self.balls.height}[self.robot]
+
+    def plane(self) -> ToolPlane:
+        """The plane of the robot's tools.
 
         Raises:
-            ConfigurationError: start_joints has not seven entries within the limits, or start_tool is out
-                of reach.
+            InvalidInputError: no posture holds them at this height.
         """
-        robot = fr3_pusher()
+        return self.kind.plane(self.kind.load(), self.height)
+
+    def joints(self) -> NDArray[np.float64]:
+        """Joint positions at the start [rad], shape (n,).
+
+        Raises:
+            ConfigurationError: start_joints has not n entries within the limits, or the start of the tools
+                is out of reach.
+        """
         if self.start_joints is None:
-            table = TableMap(robot, self.tool_height)
-            if not table.contains(self.start_tool):
-                low, high = table.radius_range
-                raise ConfigurationError(
-                    f"Scene.start_tool = {self.start_tool} is out of reach; its distance from the base must "
-                    f"be {low:.2f} to {high:.2f} m"
-                )
-            return table.joints([self.start_tool])[0]
+            return self._upright_start()
         q = np.array(self.start_joints, dtype=float)
-        lower, upper = robot.position_range
-        if q.shape != (7,) or not np.all((q >= lower) & (q <= upper)):
+        lower, upper = self.kind.load().position_range
+        if q.shape != lower.shape or not np.all((q >= lower) & (q <= upper)):
             raise ConfigurationError(
-                f"Scene.start_joints = {self.start_joints} must be 7 angles within the joint limits"
+                f"Scene.start_joints = {self.start_joints} must be {len(lower)} angles within the joint "
+                "limits"
             )
         return q
+
+    def _upright_start(self) -> NDArray[np.float64]:
+        starts: dict[str, tuple[str, tuple[float, ...]]] = {
+            "rod": ("start_tool", self.start_tool),
+            "hand": ("hand.start", self.hand.start),
+            "two_balls": ("balls.start", self.balls.start),
+        }
+        name, start = starts[self.robot]
+        plane = self.plane()
+        if not plane.contains(np.array(start)):
+            low, high = plane.radius_range
+            raise ConfigurationError(
+                f"Scene.{name} = {start} is out of reach; the distance of each flange from its base must be "
+                f"{low:.2f} to {high:.2f} m"
+            )
+        return plane.joints([start])[0]
 
 
 def build(scene: Scene) -> mujoco.MjModel:
     """Compile the scene for MuJoCo.
 
-    Names: joints ``fr3_joint1..7`` and ``object``, bodies ``object`` and ``goal`` (a see-through marker),
-        cameras ``overview``,
-    ``top`` and ``side``, site ``tool_tip``.
+    Names: joints of the robot (first in the state), then ``object``; bodies ``object``, ``goal`` (a
+    see-through marker) and ``cube0`` ...; cameras ``overview``, ``top`` and ``side``; sites ``tool_tip``.
     """
-    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    spec = robot_spec(scene.kind, scene.joint_friction, scene.joint_damping)
     spec.modelname = "push_box"
-    _set_options(spec)
-    _prepare_robot(spec, scene)
+    _set_options(spec, scene.slope)
     _add_table(spec)
     _add_object(spec, scene)
     _add_goal(spec, scene.plant)
+    _add_cubes(spec, scene.cubes)
     add_looks(spec)
     return spec.compile()
 
 
-def _set_options(spec: mujoco.MjSpec) -> None:
+def _set_options(spec: mujoco.MjSpec, slope: tuple[float, float]) -> None:
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # The elliptic cone has isotropic friction; impratio > 1 makes friction stiffer than the normal, against
@@ -174,30 +200,9 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     spec.option.impratio = 10.0
     spec.option.iterations = 20
     spec.option.tolerance = 1e-8
-
-
-def _prepare_robot(spec: mujoco.MjSpec, scene: Scene) -> None:
-    robot = fr3_pusher()
-    for name, limit, friction, damping in zip(
-        robot.joint_names, robot.torque_limits, _JOINT_FRICTION, _JOINT_DAMPING, strict=True
-    ):
-        joint = spec.joint(name)
-        joint.frictionloss = friction * scene.joint_friction
-        joint.damping = np.array([damping * scene.joint_damping, 0.0, 0.0])
-        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        motor.set_to_motor()
-        motor.ctrlrange = [-limit, limit]
-    # A capsule meets boxes in MuJoCo's exact, fast routine; above its round end (1.5 cm) it is the rod.
-    spec.body("tool").add_geom(
-        name="rod",
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=[0, 0, 0.05, 0, 0, TOOL_LENGTH - TOOL_RADIUS],
-        size=[TOOL_RADIUS, 0, 0],
-        mass=0.0,
-        group=3,
-        contype=_ROD,
-        conaffinity=0,
-    )
+    if any(slope):
+        down = np.array([math.tan(slope[0]), math.tan(slope[1]), -1.0])
+        spec.option.gravity = GRAVITY * down / np.linalg.norm(down)
 
 
 def _add_table(spec: mujoco.MjSpec) -> None:
@@ -207,7 +212,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
         size=[2, 2, 0.1],
         group=3,
         contype=0,
-        conaffinity=_ROBOT | _ROD,
+        conaffinity=LINK | ROD | CUBE,
     )
 
 
@@ -226,12 +231,13 @@ def _add_object(spec: mujoco.MjSpec, scene: Scene) -> None:
     turn = plant.mass * plant.shape.polar_radius**2
     tip = turn / 2 + plant.mass * plant.height**2 / 12
     body.inertia = np.array([tip, tip, turn])
-    for i, (kind, pos, size, quat) in enumerate(_solids(plant.shape, plant.height)):
+    for i, (kind, pos, size, quat) in enumerate(solids(plant.shape, plant.height)):
         body.add_geom(
             name=f"object{i}", type=kind, pos=pos, size=size, quat=quat, rgba=_OBJECT_COLOUR, group=2,
-            contype=0, conaffinity=_ROBOT,
+            contype=0, conaffinity=LINK | CUBE,
         )  # fmt: skip
-        _add_pair(spec, "rod", f"object{i}", plant.tool_friction, time_constant=0.01)
+        for arm in scene.kind.arms:
+            _add_pair(spec, arm.tool, f"object{i}", plant.tool_friction, time_constant=0.01)
     for i, (fx, fy) in enumerate(plant.feet()):
         body.add_geom(
             name=f"foot{i}",
@@ -264,7 +270,7 @@ def _add_pair(spec: mujoco.MjSpec, first: str, second: str, friction: float, *, 
 def _add_goal(spec: mujoco.MjSpec, plant: ObjectPlant) -> None:
     """A flat, see-through outline on the table; below the table until it is placed."""
     goal = spec.worldbody.add_body(name="goal", mocap=True, pos=[0.5, 0.0, -0.5])
-    for kind, pos, size, quat in _solids(plant.shape, 0.002):
+    for kind, pos, size, quat in solids(plant.shape, 0.002):
         goal.add_geom(
             type=kind,
             pos=pos,
@@ -278,39 +284,13 @@ def _add_goal(spec: mujoco.MjSpec, plant: ObjectPlant) -> None:
         )
 
 
-def _solids(shape: PlanarShape, height: float):
-    """Type, position, size and quaternion of one geom per primitive, standing on the object frame's z = 0."""
-    for p in shape.primitives:
-        pos = [*p.center, height / 2]
-        if isinstance(p, Disc):
-            yield mujoco.mjtGeom.mjGEOM_CYLINDER, pos, [p.radius, height / 2, 0.0], [1.0, 0.0, 0.0, 0.0]
-        else:
-            turn = [math.cos(p.angle / 2), 0.0, 0.0, math.sin(p.angle / 2)]
-            yield mujoco.mjtGeom.mjGEOM_BOX, pos, [*p.half_size, height / 2], turn
-
-
-def _primitive_feet(primitive: Rectangle | Disc, support: str) -> NDArray[np.float64]:
-    """Feet under one primitive, in the object frame; see :meth:`ObjectPlant.feet`."""
-    signs = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    if isinstance(primitive, Disc):
-        half, angle = np.full(2, primitive.radius * math.sqrt(0.5)), 0.0
-        # Four fifths of the load at this share of the radius: the second moment of a disc, r²/2.
-        share = math.sqrt(5.0 / 8.0)
-    else:
-        half, angle = np.array(primitive.half_size), primitive.angle
-        share = math.sqrt(5.0 / 12.0)  # likewise for a rectangle: half²/3 along each axis
-    local = signs * half if support == "corners" else np.vstack([signs * half * share, np.zeros((1, 2))])
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    return local @ turn.T + primitive.center
-
-
-def _first_of_each(points: NDArray) -> list[int]:
-    """Indices of points that do not repeat an earlier one."""
-    return [i for i, p in enumerate(points) if i == 0 or np.linalg.norm(points[:i] - p, axis=1).min() > 1e-6]
-
-
-def _inside_hull(points: NDArray, query: NDArray) -> bool:
-    """Whether a point is inside the hull of others: seen from it, no gap between them spans 180 degrees."""
-    angles = np.sort(np.arctan2(points[:, 1] - query[1], points[:, 0] - query[0]))
-    gaps = np.diff(np.append(angles, angles[0] + 2.0 * np.pi))
-    return bool(gaps.max() < np.pi - 1e-3)
+def _add_cubes(spec: mujoco.MjSpec, positions: tuple[tuple[float, float], ...]) -> None:
+    half = CUBE_SIDE / 2
+    for i, (x, y) in enumerate(positions):
+        body = spec.worldbody.add_body(name=f"cube{i}", pos=[x, y, half])
+        body.add_freejoint(name=f"cube{i}")
+        body.add_geom(
+            name=f"cube{i}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3, density=_CUBE_DENSITY,
+            rgba=_CUBE_COLOUR, group=2, contype=CUBE, conaffinity=CUBE | LINK | ROD,
+            friction=[_CUBE_FRICTION, 0.005, 1e-4], priority=1, solref=[0.01, 1.0],
+        )  # fmt: skip

@@ -4,41 +4,20 @@ Per step: the reference of the trajectory follower, the impedance controller, Mu
 watches the object.
 """
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_bridge.camera import Camera, CameraConfig, CameraFrame
+from sim_bridge.contacts import Contacts, RobotContacts
+from sim_bridge.disturbances import Disturbances, Hand, Push
 from sim_bridge.impedance import ImpedanceConfig, ImpedanceController
 from sim_bridge.limit_monitor import LimitMonitor
 from sim_bridge.scene import TIMESTEP, Scene, build
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryFollower
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.robot.inverse_kinematics import TableMap
-from vpsto_ros.robot.kinematics import forward_kinematics_batch, fr3_pusher, tip_velocity_batch
 
-_HAND_FREQUENCY = 60.0  # of the servoed hand [rad/s]
-_HAND_FORCE = 25.0  # what the hand pushes with at most, beyond the object's weight [N]
-
-
-@dataclass
-class _Push:
-    """A constant wrench on the object until a time."""
-
-    end: float
-    wrench: NDArray[np.float64]
-
-
-@dataclass
-class _Hand:
-    """A hand that moves the object from one point to another."""
-
-    begin: float
-    duration: float
-    origin: NDArray[np.float64]
-    displacement: NDArray[np.float64]
+_DISPLACEMENT = 0.05  # largest displacement of the object at once [m]
 
 
 class Simulation:
@@ -49,11 +28,12 @@ class Simulation:
         model: the MuJoCo model, for renderers and inspection.
         data: the MuJoCo data.
         robot: the model that controllers and planners use.
+        plane: the plane of the robot's tools at the scene's height.
         follower: takes trajectories: ``simulation.follower.accept(command, simulation.time)``.
         controller: the impedance controller.
         camera: the camera.
-        limits: counts what breaks the arm's limits.
-        tool_height_deviation: largest distance of the tip from the scene's tool_height so far [m].
+        limits: counts what breaks the arms' limits.
+        tool_height_deviation: largest distance of a tip from the scene's height so far [m].
     """
 
     def __init__(
@@ -80,29 +60,32 @@ class Simulation:
         self.scene = scene or Scene()
         self.model = build(self.scene)
         self.data = mujoco.MjData(self.model)
-        self.robot = fr3_pusher()
+        kind = self.scene.kind
+        self.robot, self.plane = kind.load(), self.scene.plane()
         start = self.scene.joints()
-        nominal = TableMap(self.robot, self.scene.tool_height).joints([(0.5, 0.0)])[0]
+        nominal = self.plane.joints([kind.nominal])[0]
         self.follower = TrajectoryFollower(self.robot.limits, self.robot.joint_names, start, follower)
-        self.controller = ImpedanceController(self.robot, nominal, impedance, period=TIMESTEP)
+        self.controller = ImpedanceController(
+            self.robot, nominal, impedance, round_tool=kind.round_tool, period=TIMESTEP
+        )
         self.camera = Camera(camera or CameraConfig(), np.random.default_rng(seed))
         self.limits = LimitMonitor(self.robot.limits)
         self.tool_height_deviation = 0.0
         self._steps = 0
-        self._disturbances: list[_Push | _Hand] = []
+        self._disturbances = Disturbances(self.model, self.data, self.scene.plant)
+        self._contacts = Contacts(self.model, self.data, kind)
         self._bind()
         self.reset()
 
     def _bind(self) -> None:
         """Views into MuJoCo's state, taken once: they stay valid as long as the data lives."""
-        d = self.data
-        self._q, self._qd = d.qpos[:7], d.qvel[:7]
-        self._object_q, self._object_qd = d.qpos[7:14], d.qvel[7:13]
+        d, n = self.data, self.robot.dof
+        self._q, self._qd = d.qpos[:n], d.qvel[:n]
+        self._object_q, self._object_qd = d.qpos[n : n + 7], d.qvel[n : n + 6]
         self._ctrl = d.ctrl
-        self._body = self.model.body("object").id
-        self._wrench = d.xfrc_applied[self._body]
-        self._object_com = d.xipos[self._body]
-        self._tip = d.site_xpos[self.model.site("tool_tip").id]
+        self._object_com = d.xipos[self.model.body("object").id]
+        names = [f"{arm.prefix}tool_tip" for arm in self.scene.kind.arms]
+        self._tips = [d.site_xpos[self.model.site(name).id] for name in names]
 
     @property
     def time(self) -> float:
@@ -124,11 +107,13 @@ class Simulation:
         controller = self.controller
         self._ctrl[:] = controller.torque(self._q, self._qd, q_des, qd_des, qdd_des)
         self.limits.observe(q_des, qd_des, qdd_des, self._q, self._qd, controller.demand)
-        deviation = abs(self._tip[2] - self.scene.tool_height)
-        if deviation > self.tool_height_deviation:
-            self.tool_height_deviation = float(deviation)
-        if self._disturbances:
-            self._disturb(now)
+        for tip in self._tips:
+            deviation = abs(tip[2] - self.plane.height)
+            if deviation > self.tool_height_deviation:
+                self.tool_height_deviation = float(deviation)
+        self._contacts.count()
+        if self._disturbances.active:
+            self._disturbances.apply(now)
         if now >= self.camera.next_capture:
             self.camera.capture(now, self.object_pose())
         mujoco.mj_step2(model, data)
@@ -141,26 +126,26 @@ class Simulation:
 
     @property
     def joint_position(self) -> NDArray[np.float64]:
-        """Measured joint positions [rad], shape (7,)."""
+        """Measured joint positions [rad], shape (n,)."""
         return self._q.copy()
 
     @property
     def joint_velocity(self) -> NDArray[np.float64]:
-        """Measured joint velocities [rad/s], shape (7,)."""
+        """Measured joint velocities [rad/s], shape (n,)."""
         return self._qd.copy()
 
     @property
     def joint_torque(self) -> NDArray[np.float64]:
-        """Torques of the last control cycle [Nm], shape (7,)."""
+        """Torques of the last control cycle [Nm], shape (n,)."""
         return self._ctrl.copy()
 
-    def tool_position(self) -> NDArray[np.float64]:
-        """True position of the rod's tip in the base frame [m], shape (3,)."""
-        return forward_kinematics_batch(self._q[None])[0]
+    def tool_position(self, tool: int = 0) -> NDArray[np.float64]:
+        """True position of a tool's tip in the base frame [m], shape (3,); tools count from 0."""
+        return self.plane.tips(self._q)[tool]
 
-    def tool_velocity(self) -> NDArray[np.float64]:
-        """True velocity of the rod's tip in the base frame [m/s], shape (3,)."""
-        return tip_velocity_batch(self._q[None], self._qd[None])[0]
+    def tool_velocity(self, tool: int = 0) -> NDArray[np.float64]:
+        """True velocity of a tool's tip in the base frame [m/s], shape (3,); tools count from 0."""
+        return self.plane.tip_velocities(self._q, self._qd)[tool]
 
     def object_pose(self) -> NDArray[np.float64]:
         """True pose of the object (x, y, yaw) [m, rad], shape (3,)."""
@@ -175,18 +160,15 @@ class Simulation:
         """What the camera has delivered since the last call."""
         return self.camera.poll(self.time)
 
-    def tool_contact_force(self) -> NDArray[np.float64]:
-        """Force of the rod on the object during the last step [N], base frame, shape (3,)."""
-        total, wrench = np.zeros(3), np.zeros(6)
-        for index in range(self.data.ncon):
-            contact = self.data.contact[index]
-            names = {self.model.geom(contact.geom1).name, self.model.geom(contact.geom2).name}
-            if "rod" in names and any(name.startswith("object") for name in names):
-                mujoco.mj_contactForce(self.model, self.data, index, wrench)
-                # The frame's first axis points from geom 1 to geom 2.
-                sign = 1.0 if self.model.geom(contact.geom1).name == "rod" else -1.0
-                total += sign * (contact.frame.reshape(3, 3).T @ wrench[:3])
-        return total
+    def tool_contact_force(self, tool: int | None = None) -> NDArray[np.float64]:
+        """Force on the object during the last step [N], base frame, shape (3,): of one tool, or of all."""
+        tools = range(len(self._tips)) if tool is None else [tool]
+        return np.sum([self._contacts.tool_force(k) for k in tools], axis=0)
+
+    @property
+    def robot_contacts(self) -> RobotContacts:
+        """During how many steps arms touched each other, the table, or the object not by their tools."""
+        return self._contacts.counts()
 
     def push_object(self, force: ArrayLike, torque: ArrayLike, duration: float) -> None:
         """Push the object at its centre of mass with a constant wrench.
@@ -200,7 +182,7 @@ class Simulation:
             InvalidInputError: force or torque is not three finite numbers, or the duration is not positive.
         """
         wrench = np.concatenate([_vector(force, "force", 3), _vector(torque, "torque", 3)])
-        self._disturbances.append(_Push(self.time + _positive(duration, "duration"), wrench))
+        self._disturbances.active.append(Push(self.time + _positive(duration, "duration"), wrench))
 
     def knock(self, displacement: ArrayLike, duration: float = 0.25) -> None:
         """Let a hand move the object by about displacement (2,) [m] within a duration [s].
@@ -211,12 +193,26 @@ class Simulation:
         Raises:
             InvalidInputError: the displacement is not two finite numbers, or the duration is not positive.
         """
-        origin = self._object_center()
-        self._disturbances.append(
-            _Hand(
-                self.time, _positive(duration, "duration"), origin, _vector(displacement, "displacement", 2)
-            )
-        )
+        origin = self._object_com[:2].copy()
+        move = _vector(displacement, "displacement", 2)
+        self._disturbances.active.append(Hand(self.time, _positive(duration, "duration"), origin, move))
+
+    def displace_object(self, dx: float, dy: float) -> None:
+        """Put the object somewhere else on the table at once, at rest, as somebody does between two runs.
+
+        Args:
+            dx: by how much along x [m], at most 5 cm.
+            dy: likewise along y.
+
+        Raises:
+            InvalidInputError: dx or dy is not a finite number, or larger.
+        """
+        move = _vector([dx, dy], "displacement", 2)
+        if np.abs(move).max() > _DISPLACEMENT:
+            raise InvalidInputError(f"the object is displaced by at most {_DISPLACEMENT} m, got ({dx}, {dy})")
+        self._object_q[:2] += move
+        self._object_qd[:] = 0.0
+        mujoco.mj_forward(self.model, self.data)
 
     def reset(self, object_pose: ArrayLike | None = None, joints: ArrayLike | None = None) -> None:
         """Put object and arm back, at rest, holding.
@@ -231,55 +227,22 @@ class Simulation:
             InvalidInputError: a wrong shape, or joints beyond their limits.
         """
         x, y, yaw = _vector(self.scene.object_pose if object_pose is None else object_pose, "object_pose", 3)
-        q = _vector(self.scene.joints() if joints is None else joints, "joints", 7)
+        q = _vector(self.scene.joints() if joints is None else joints, "joints", self.robot.dof)
         lower, upper = self.robot.position_range
         if np.any(q < lower) or np.any(q > upper):
             raise InvalidInputError(f"joints {np.round(q, 3).tolist()} are beyond their position limits")
         data = self.data
+        data.qpos[:] = self.model.qpos0  # cubes go back, too
         data.qvel[:] = 0.0
         data.qacc_warmstart[:] = 0.0
         data.xfrc_applied[:] = 0.0
         self._q[:] = q
         self._object_q[:] = (x, y, 0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
-        self._disturbances.clear()
+        self._disturbances.active.clear()
         self.camera.clear()
         self.controller.reset()
         self.follower.hold(q, self.time)
         mujoco.mj_forward(self.model, data)
-
-    def _object_center(self) -> NDArray[np.float64]:
-        """Centre of mass of the object in the plane [m]."""
-        return self._object_com[:2].copy()
-
-    def _disturb(self, now: float) -> None:
-        """Add up the disturbances of this instant; drop those that are over."""
-        self._wrench[:] = 0.0
-        running: list[_Push | _Hand] = []
-        for disturbance in self._disturbances:
-            if isinstance(disturbance, _Push) and now < disturbance.end:
-                self._wrench += disturbance.wrench
-                running.append(disturbance)
-            elif isinstance(disturbance, _Hand) and now < disturbance.begin + disturbance.duration:
-                self._wrench[:2] += self._hand_force(disturbance, now)
-                running.append(disturbance)
-        self._disturbances = running
-
-    def _hand_force(self, hand: _Hand, now: float) -> NDArray[np.float64]:
-        """Critically damped servo along a minimum-jerk path."""
-        s = (now - hand.begin) / hand.duration
-        share = s**3 * (10.0 - 15.0 * s + 6.0 * s * s)
-        rate = 30.0 * (s * (1.0 - s)) ** 2 / hand.duration
-        bend = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / hand.duration**2
-        w, plant = _HAND_FREQUENCY, self.scene.plant
-        offset = hand.origin + share * hand.displacement - self._object_com[:2]
-        velocity = np.empty(6)
-        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, self._body, velocity, 0)
-        slip = rate * hand.displacement - velocity[3:5]
-        along = slip + w * offset
-        grip = plant.table_friction * plant.mass * 9.81 * along / (np.linalg.norm(along) + 0.02)
-        force = plant.mass * (bend * hand.displacement + 2.0 * w * slip + w * w * offset) + grip
-        most = _HAND_FORCE + plant.mass * 9.81
-        return force * min(1.0, most / max(float(np.linalg.norm(force)), 1e-9))
 
 
 def _vector(values: ArrayLike, name: str, size: int) -> NDArray[np.float64]:

@@ -23,11 +23,13 @@ class ToolPlane(Protocol):
         robot: the arm or arms.
         dof: number m of plane coordinates.
         height: height of the tools' tips above the table [m].
+        radius_range: distances of each flange from its base axis within the joint limits [m].
     """
 
     robot: Robot
     dof: int
     height: float
+    radius_range: tuple[float, float]
 
     def joints(self, points: ArrayLike) -> NDArray[np.float64]:
         """Joint positions (K, n) [rad] for plane points (K, m); InfeasibleError out of reach."""
