@@ -1,4 +1,4 @@
-"""The simulated FR3 as a ROS 2 node: what a robot's driver, its controller and a camera offer on a real one.
+"""The simulated robot as a ROS 2 node: what a robot's driver, its controller and a camera offer on a real one.
 
 The physics run in the main thread by simulated time; a second thread executes callbacks, which only put
 requests into a queue that the physics take between two slices. So nothing ever happens in the middle of a
@@ -257,7 +257,8 @@ class FrankaDriver(ManagedNode):
         self._desired_publisher.publish(messages.desired_joints(sim, frame))
         self._wrench_publisher.publish(messages.external_wrench(sim, frame))
         self._object_publisher.publish(messages.true_object(sim, frame))
-        self._tool_publisher.publish(messages.true_tool(sim, frame))
+        for message in messages.true_tools(sim, frame):
+            self._tool_publisher.publish(message)
 
     def _publish_markers(self) -> None:
         self._marker_publisher.publish(messages.scene_markers(self.simulation, self.config.base_frame))

@@ -147,6 +147,26 @@ class Simulation:
         """True velocity of a tool's tip in the base frame [m/s], shape (3,); tools count from 0."""
         return self.plane.tip_velocities(self._q, self._qd)[tool]
 
+    def arm_points(self) -> list[NDArray[np.float64]]:
+        """Each arm as a polyline (P, 3) [m]: base, joints, flange, the corner of a crank, tip of the tool.
+
+        As of the last step's beginning; made to be drawn.
+        """
+        lines = []
+        for arm, tip in zip(self.scene.kind.arms, self._tips, strict=True):
+            links = [self.data.body(f"{arm.prefix}fr3_link{i}").xpos for i in range(8)]
+            flange = self.data.site(f"{arm.prefix}flange").xpos
+            axis = self.data.site(f"{arm.prefix}tool_tip").xmat.reshape(3, 3)[:, 2]
+            corner = tip - axis * (axis @ (tip - flange))
+            bend = [corner] if np.linalg.norm(corner - flange) > 1e-6 else []
+            lines.append(np.array([*links, flange, *bend, tip]))
+        return lines
+
+    def cube_positions(self) -> NDArray[np.float64]:
+        """Centres (C, 3) [m] of the loose cubes."""
+        bodies = [self.data.body(f"cube{i}").xpos for i in range(len(self.scene.cubes))]
+        return np.array(bodies).reshape(-1, 3)
+
     def object_pose(self) -> NDArray[np.float64]:
         """True pose of the object (x, y, yaw) [m, rad], shape (3,)."""
         x, y, _, w, i, j, k = self._object_q.tolist()

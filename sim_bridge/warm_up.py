@@ -15,6 +15,8 @@ from sim_bridge.experiments.clutter.mpc_runs import Task, run_task
 from sim_bridge.experiments.clutter.mppi import MppiConfig
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from sim_bridge.experiments.pushing.loop import push_box_loop
+from sim_bridge.scene import Scene
+from sim_bridge.simulation import Simulation
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.planar_discs import MovingDisc
@@ -36,7 +38,7 @@ def run(_arguments: argparse.Namespace | None = None) -> int:
         0.
     """
     began = time.perf_counter()
-    for use in (push_a_box, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
+    for use in (push_a_box, move_two_arms, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
     return 0
@@ -47,6 +49,13 @@ def push_a_box() -> None:
     push_box_loop().advance(0.5)
     model = PushingModel(PlanarShape.box(0.12, 0.12), PlanarShape.disc(0.015))
     push_directions(model, np.array([[-0.075, 0.0]]), np.array([[1.0, 0.0]]))
+
+
+def move_two_arms() -> None:
+    """Kinematics and simulation of the balls."""
+    simulation = Simulation(Scene(robot="two_balls"))
+    simulation.advance(0.01)
+    simulation.tool_velocity()
 
 
 def evaluate_a_trajectory() -> None:

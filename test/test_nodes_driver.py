@@ -1,6 +1,7 @@
 """The simulated driver: rules, topics, services, what it refuses and what it survives."""
 
 import itertools
+import math
 import os
 import random
 import subprocess
@@ -27,6 +28,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from sim_bridge.franka_driver import FrankaDriver, FrankaDriverConfig
 from sim_bridge.pacing import Pacer, Ticker
@@ -34,10 +36,12 @@ from vpsto_ros.nodes.contact_planner import ContactPlannerNode
 from vpsto_ros.nodes.conversions import SIMULATED, read_observation
 from vpsto_ros.nodes.diagnostics import Pulse
 from vpsto_ros.nodes.joint_conversions import read_joint_state, trajectory_message
+from vpsto_ros.nodes.markers import arm_points
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.state_estimator import StateEstimator
-from vpsto_ros.robot.kinematics import JOINT_NAMES
-from vpsto_ros.trajectory import OptimalBasis, synthesize
+from vpsto_ros.planning.plane_path import follow_plane
+from vpsto_ros.robot.kinematics import JOINT_NAMES, fr3_bimanual
+from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "config" / "push_box.yaml"
@@ -179,6 +183,65 @@ def test_a_trajectory_is_followed_and_nothing_is_lost(cell):
     assert report.values["limit_violations"] == 0
     assert report.values["trajectories_accepted"] == 1
     assert report.values["steps"] == round(made.driver.simulation.time * 1000)
+
+
+def test_two_arms_are_driven_like_one(cell):
+    made = cell(scene__robot="two_balls", object__kind="disc", object__size=[0.1, 0.1], base_frame="table")
+    made.listen(JointState, "joint_states")
+    made.listen(WrenchStamped, "external_wrench")
+    made.listen(Odometry, "franka_driver/ground_truth/tool")
+    made.listen(MarkerArray, "franka_driver/markers")
+    made.connect()
+    made.advance(0.1)
+    sim, names = made.driver.simulation, fr3_bimanual().joint_names
+    start = np.array(sim.scene.balls.start)
+    keys = np.stack([start, np.array([0.415, 0.036, 0.415, -0.036]), np.array([0.465, 0.036, 0.465, -0.036])])
+    times = sim.time + 0.05 + np.array([0.0, 1.5, 2.5])
+    plane = Trajectory.from_points(times, keys, np.zeros_like(keys))
+    motion = follow_plane(plane, sim.plane).trajectory
+    made.send(trajectory_message(motion, names))
+    made.advance(2.8)
+    report = made.driver.report()
+    assert report.level == 0, report.message
+    assert report.values["trajectories_accepted"] == 1 and report.values["limit_violations"] == 0
+    assert report.values["contact.arms.steps"] == report.values["contact.table.steps"] == 0
+    joints = made.received["joint_states"][-1]
+    assert tuple(joints.name) == names and len(joints.effort) == 14
+    assert read_joint_state(joints, names)[0] == pytest.approx(motion(motion.end_time), abs=5e-3)
+    tools = {message.child_frame_id: message for message in made.received["franka_driver/ground_truth/tool"]}
+    assert set(tools) == {"left_fr3_tool", "right_fr3_tool"}
+    for side, y in (("left", 0.036), ("right", -0.036)):
+        tool = tools[f"{side}_fr3_tool"].pose.pose.position
+        assert (tool.x, tool.y, tool.z) == pytest.approx((0.465, y, 0.035), abs=3e-3)
+    pushed = 0.465 + math.sqrt(0.08**2 - 0.036**2)
+    assert sim.object_pose()[:2] == pytest.approx((pushed, 0.0), abs=4e-3)
+    assert min(message.wrench.force.x for message in made.received["external_wrench"]) < -1.0
+    drawn = {marker.ns: marker for marker in made.received["franka_driver/markers"][-1].markers}
+    assert {"left_robot", "right_robot", "balls", "object"} <= set(drawn)
+    for side, end in zip(("left", "right"), sim.plane.tips(sim.joint_position), strict=True):
+        line = [(p.x, p.y, p.z) for p in drawn[f"{side}_robot"].points]
+        assert line[0] == pytest.approx((0.0, 0.22 if side == "left" else -0.22, 0.0))
+        assert len(line) == 11 and line[-1] == pytest.approx(tuple(end), abs=1e-3)
+        assert line[-2][2] == pytest.approx(end[2] + 0.2, abs=2e-3), "the crank's corner is above the ball"
+
+
+def test_the_hand_is_published_with_its_yaw(cell):
+    made = cell(scene__robot="hand", scene__hand__start=[0.4, -0.1, 2.0])
+    made.listen(Odometry, "franka_driver/ground_truth/tool")
+    made.listen(MarkerArray, "franka_driver/markers")
+    made.connect()
+    made.advance(0.2)
+    pose = made.received["franka_driver/ground_truth/tool"][-1].pose.pose
+    assert 2.0 * math.atan2(pose.orientation.z, pose.orientation.w) == pytest.approx(2.0, abs=1e-3)
+    assert (pose.position.x, pose.position.y) == pytest.approx((0.4, -0.1), abs=1e-3)
+    assert {"robot", "hand"} <= {marker.ns for marker in made.received["franka_driver/markers"][-1].markers}
+
+
+def test_the_markers_of_the_rod_are_the_arm_from_base_to_tip(cell):
+    made = cell()
+    made.advance(0.05)
+    sim = made.driver.simulation
+    np.testing.assert_allclose(sim.arm_points()[0], arm_points(sim.joint_position), atol=1e-5)
 
 
 def wrong_names(message):
