@@ -1,4 +1,4 @@
-"""The simulated robot as a ROS 2 node: what a robot's driver, its controller and a camera offer on a real one.
+"""The simulated robot as a ROS 2 node: what a driver, its controller and a camera offer on a real one.
 
 The physics run in the main thread by simulated time; a second thread executes callbacks, which only put
 requests into a queue that the physics take between two slices. So nothing ever happens in the middle of a
