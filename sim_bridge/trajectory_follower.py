@@ -40,6 +40,20 @@ class TrajectoryCommand:
     velocities: ArrayLike | None = None
     accelerations: ArrayLike | None = None
 
+    @classmethod
+    def of(cls, trajectory: Trajectory, joint_names: Sequence[str]) -> "TrajectoryCommand":
+        """What makes the controller reproduce a trajectory of cubics, or of quintics without a jump.
+
+        Cubics are sent without accelerations: theirs may jump at the knots.
+        """
+        positions, velocities, accelerations = trajectory.knots()
+        start = trajectory.start_time
+        quintic = bool(np.any(trajectory.coefficients[:, 4:]))
+        return cls(
+            joint_names, start, trajectory.times - start, positions, velocities,
+            accelerations if quintic else None,
+        )  # fmt: skip
+
 
 class TrajectoryRejected(InvalidInputError):
     """A command broke a rule; the reference goes on as before.

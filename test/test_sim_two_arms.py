@@ -38,9 +38,7 @@ def go(simulation, *points, speed=0.1):
     times = simulation.time + np.concatenate([[0.0], np.cumsum(np.maximum(durations, 0.2))])
     plane = Trajectory.from_points(times, keys, np.zeros_like(keys))
     joints = follow_plane(plane, simulation.plane).trajectory
-    q, qd, _ = joints.knots()
-    command = TrajectoryCommand(simulation.robot.joint_names, times[0], joints.times - times[0], q, qd)
-    simulation.follower.accept(command, simulation.time)
+    simulation.follower.accept(TrajectoryCommand.of(joints, simulation.robot.joint_names), simulation.time)
     simulation.advance(joints.duration + 0.2)
     return simulation
 
@@ -69,6 +67,35 @@ def test_two_balls_cradle_a_can_and_take_it_along():
     assert simulation.limits.violations == 0 and not simulation.robot_contacts.any
 
 
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_motion_at_the_limits_is_taken_as_it_was_planned_and_followed(smooth):
+    """Round the can and back, slowed down as the joints need it; the controller sees the same polynomials."""
+    t = np.linspace(0.0, 1.0, 21)
+    turn = 4.0 * np.pi * t**2 * (3.0 - 2.0 * t)
+    rate, bend = 4.0 * np.pi * (6.0 * t - 6.0 * t**2), 4.0 * np.pi * (6.0 - 12.0 * t)
+    sides, parts = np.array([1.0, 1.0]), [np.zeros((21, 4)) for _ in range(3)]
+    parts[0] += APART
+    for k in (0, 2):
+        parts[0][:, k : k + 2] += 0.05 * np.column_stack([np.cos(turn) - 1.0, np.sin(turn)]) * sides
+        parts[1][:, k : k + 2] = 0.05 * rate[:, None] * np.column_stack([-np.sin(turn), np.cos(turn)])
+        swing, pull = (
+            np.column_stack([-np.sin(turn), np.cos(turn)]),
+            np.column_stack([np.cos(turn), np.sin(turn)]),
+        )
+        parts[2][:, k : k + 2] = 0.05 * (bend[:, None] * swing - (rate**2)[:, None] * pull)
+    plane = Trajectory.from_points(t, parts[0], parts[1], parts[2] if smooth else None)
+    simulation = Simulation(scene(start=APART))
+    followed = follow_plane(plane, simulation.plane)
+    assert followed.stretch > 1.0
+    joints = followed.trajectory
+    simulation.follower.accept(TrajectoryCommand.of(joints, simulation.robot.joint_names), 0.0)
+    taken = simulation.follower.active
+    np.testing.assert_allclose(taken.coefficients, joints.coefficients, rtol=1e-6, atol=1e-5)
+    simulation.advance(joints.duration)
+    assert simulation.limits.violations == 0
+    np.testing.assert_allclose(simulation.plane.tool(simulation.joint_position), plane(1.0), atol=4e-3)
+
+
 def test_forces_of_both_balls_add_up_to_the_friction_of_the_table():
     start = around((0.45, 0.0), np.pi - 0.6, np.pi + 0.6)
     simulation = Simulation(scene(start=start, object_pose=(0.45, 0.0, 0.0)))
@@ -78,9 +105,7 @@ def test_forces_of_both_balls_add_up_to_the_friction_of_the_table():
     points = here + np.array([0.0, 0.0125, 0.1125, 0.125])[:, None] * along
     rates = np.array([0.0, 0.05, 0.05, 0.0])[:, None] * along
     joints = follow_plane(Trajectory.from_points(times, points, rates), simulation.plane).trajectory
-    q, qd, _ = joints.knots()
-    names = simulation.robot.joint_names
-    simulation.follower.accept(TrajectoryCommand(names, 0.0, joints.times, q, qd), 0.0)
+    simulation.follower.accept(TrajectoryCommand.of(joints, simulation.robot.joint_names), 0.0)
     simulation.advance(1.2)
     forces = []
     for _ in range(800):

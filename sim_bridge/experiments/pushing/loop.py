@@ -44,16 +44,6 @@ class Recording:
     planned_height_error: float = 0.0
 
 
-def command_from(trajectory: Trajectory, joint_names: tuple[str, ...]) -> TrajectoryCommand:
-    """The message that carries a trajectory: knots with velocities, which a controller joins by cubics.
-
-    Every segment of a planned trajectory is a cubic, so that the controller reproduces it.
-    """
-    positions, velocities, _ = trajectory.knots()
-    start = trajectory.start_time
-    return TrajectoryCommand(joint_names, start, trajectory.times - start, positions, velocities)
-
-
 class PushingLoop:
     """Runs the closed loop step by step."""
 
@@ -119,7 +109,7 @@ class PushingLoop:
         self._check_height(trajectory)
         try:
             self.simulation.follower.accept(
-                command_from(trajectory, self.planner.robot.joint_names), self.simulation.time
+                TrajectoryCommand.of(trajectory, self.planner.robot.joint_names), self.simulation.time
             )
             self.planner.accept(step)
         except TrajectoryRejected as reason:
