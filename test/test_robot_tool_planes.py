@@ -1,5 +1,6 @@
 """The two arms and the hand: true copies of one arm, tools as Pinocchio and MuJoCo see them, exact maps."""
 
+import itertools
 import xml.etree.ElementTree
 
 import mujoco
@@ -9,7 +10,7 @@ import pytest
 
 from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, InvalidInputError
 from vpsto_ros.robot import tip_kinematics as tools
-from vpsto_ros.robot.bimanual_plane import BimanualPlane
+from vpsto_ros.robot.bimanual_plane import WORKSPACE, BimanualPlane
 from vpsto_ros.robot.hand_plane import HandPlane
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import (
@@ -223,6 +224,45 @@ def test_the_yaw_of_the_hand_does_not_wrap():
     q = plane.joints(turns)
     np.testing.assert_allclose(plane.tool(q), turns, atol=1e-9)
     assert np.abs(np.diff(q, axis=0)).max() < 0.15
+
+
+def pairs_of_balls(count, seed, near):
+    """Both balls anywhere in the workspace, or close to each other in it."""
+    rng, (x, y) = np.random.default_rng(seed), WORKSPACE
+    points = rng.uniform([x[0], y[0]] * 2, [x[1], y[1]] * 2, (count, 4))
+    if near:
+        turn, reach = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.065, 0.2, count)
+        points[:, 2:] = points[:, :2] + reach[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    return points[((points[:, 2:] >= [x[0], y[0]]) & (points[:, 2:] <= [x[1], y[1]])).all(axis=1)]
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_arms_keep_clear_of_each_other_and_themselves_where_the_rule_says_so(near):
+    plane, model = PLANES["balls"](), mujoco.MjModel.from_xml_path(str(BIMANUAL_MODEL_PATH))
+    data, points = mujoco.MjData(model), pairs_of_balls(4000, 3, near)
+    assert plane.contains(points).all()
+    apart = plane.arms_apart(points)
+    assert 0.1 < apart.mean() < 1.0
+    for k, q in enumerate(plane.joints(points)):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        assert not (apart[k] and data.ncon), points[k]
+    assert (plane.arms_apart(points, 0.02) <= apart).all()
+
+
+def test_the_rule_leaves_five_millimetres_between_all_that_is_seen_of_the_arms():
+    plane, model = PLANES["balls"](), mujoco.MjModel.from_xml_path(str(BIMANUAL_MODEL_PATH))
+    data, points = mujoco.MjData(model), pairs_of_balls(400, 4, near=True)
+    hulls = [i for i in range(model.ngeom) if model.geom(i).name.endswith("_envelope")]
+    sides = [[i for i in hulls if model.geom(i).name.startswith(side)] for side in ("left", "right")]
+    for q in plane.joints(points[plane.arms_apart(points)])[:100]:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        for i, j in itertools.product(*sides):
+            gap = np.linalg.norm(data.geom_xpos[i] - data.geom_xpos[j]) - model.geom_rbound[[i, j]].sum()
+            if gap < 0.005:
+                assert mujoco.mj_geomDistance(model, data, i, j, 0.1, None) > 0.0049, (i, j)
 
 
 def test_mirrored_balls_are_mirrored_joints():

@@ -17,11 +17,19 @@ from vpsto_ros.robot.tip_kinematics import (
 from vpsto_ros.robot.tool_plane import Motion, check_geometry, motion_rows, plane_rows
 from vpsto_ros.robot.upright_arm import UprightArm
 
+# What keeps the arms apart, found by scanning the model; see BimanualPlane.arms_apart.
+LEAST_DISTANCE = 0.065  # between the centres of the balls [m]
+CROSSED_OFFSET = 0.05  # along x, where the left ball is to the right (-y) of the right one [m]
+LARGEST_CROSSING = 0.12  # how far the left ball may be to the right of the right one [m]
+
+WORKSPACE = ((0.31, 0.70), (-0.31, 0.31))
+"""Ranges of x and y [m] in which each ball can be wherever the other one is, at the usual height."""
+
 
 class BimanualPlane:
     """The plane of two balls on two arms: (x_left, y_left, x_right, y_right), see :class:`ToolPlane`.
 
-    Whether the arms keep clear of each other is not known here.
+    Reach says nothing about the arms' keeping clear of each other: that is :meth:`arms_apart`.
 
     Attributes:
         robot: both arms; joints of the left one come first.
@@ -106,6 +114,23 @@ class BimanualPlane:
             pan = np.arctan2(flange[..., 1], flange[..., 0])
             inside &= arm.reaches(flange, margin) & arm.within([0, 6], np.stack([pan, pan], axis=-1))
         return inside
+
+    def arms_apart(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
+        """Whether no part of one arm is within 5 mm of the other, for (x_l, y_l, x_r, y_r), shape (..., 4).
+
+        A sufficient rule about the balls alone, for :data:`WORKSPACE`: they are not too close; where the left
+        one is to the right of the right one, the cranks need room to pass each other along x; and beyond a
+        certain crossing the wrists would meet.
+
+        Args:
+            points: plane points [m].
+            margin: by how much to keep inside the rule [m].
+        """
+        points = np.asarray(points, dtype=float)
+        ahead, aside = points[..., 0] - points[..., 2], points[..., 1] - points[..., 3]
+        distant = np.hypot(ahead, aside) >= LEAST_DISTANCE + margin
+        passing = (aside >= 0.0) | (np.abs(ahead) >= CROSSED_OFFSET + margin)
+        return distant & passing & (aside >= margin - LARGEST_CROSSING)
 
     def tool(self, q: ArrayLike) -> NDArray[np.float64]:
         """(x_l, y_l, x_r, y_r) [m] of the balls, shape (..., 4), for joint positions (..., 14) [rad]."""
