@@ -19,7 +19,7 @@ HEAVY = {
     "rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags", "joblib", "dask", "distributed",
 }  # fmt: skip
 ROOMS = (
-    "trajectory", "contact", "robot", "collision", "priors", "estimation", "optimization", "planning",
+    "trajectory", "contact", "robot", "collision", "priors", "belief", "estimation", "optimization", "planning",
     "nodes",
 )  # fmt: skip
 """A room may import those before it, and the modules that belong to no room."""

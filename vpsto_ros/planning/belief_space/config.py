@@ -1,0 +1,107 @@
+"""Options of planning in belief space."""
+
+import dataclasses
+
+from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.optimization.vpsto import VpstoConfig
+
+
+@documented
+@dataclasses.dataclass(frozen=True)
+class RobustPushingConfig:
+    """Options of BS-VP-STO; the deterministic baseline is ``robust = False``: no variance terms at all."""
+
+    robust: bool = option(True, "whether the variance gain is a cost and a constraint")
+    contact_prior: bool = option(True, "whether candidates are drawn around likely contacts (Q_q of 6.39)")
+    points: int = option(2, "points per horizon N: via-points and the free end", minimum=1, maximum=10)
+    steps: int = option(40, "steps of a horizon K", minimum=2, maximum=1000)
+    executed: int = option(12, "steps that are executed before planning anew, H", minimum=1, maximum=1000)
+    perturbation: float = option(
+        1e-6, "variance of the perturbation in a step V_w", unit="m^2", minimum=1e-12, maximum=1e-2
+    )
+    progress_weight: float = option(
+        30.0, "lambda of the progress cost (6.54)", unit="1/m", minimum=0.1, maximum=1e4
+    )
+    variance_weight: float = option(
+        4.0,
+        "w of the distance sqrt(|mean - goal|^2 + w V) whose decrease is the progress; 0 is the thesis's",
+        minimum=0.0,
+        maximum=1e3,
+    )
+    aside_weight: float = option(
+        2.0, "how much more a metre beside a path counts than one along it", minimum=1.0, maximum=100.0
+    )
+    duration_weight: float = option(0.0, "cost of a second of motion", unit="1/s", minimum=0.0, maximum=1e3)
+    wedge: float = option(
+        -0.5,
+        "a plan is invalid when the normals of two contacts have a smaller product: it squeezes the object",
+        minimum=-1.0,
+        maximum=1.0,
+    )
+    longest_step: float = option(
+        0.02, "a plan is invalid when the object jumps farther in a step", unit="m", minimum=1e-4, maximum=1.0
+    )
+    separation: float = option(
+        0.005, "smallest gap between end effectors", unit="m", minimum=0.0, maximum=0.5
+    )
+    contact_angle: float = option(
+        0.6,
+        "half the angle between two end effectors behind the object, seen from its centre",
+        unit="rad",
+        minimum=0.0,
+        maximum=1.5,
+    )
+    contact_advance: float = option(
+        0.03, "how far the contact prior lies ahead of touching", unit="m", minimum=-0.2, maximum=0.2
+    )
+    contact_std: float = option(
+        0.03, "standard deviation of the contact prior", unit="m", minimum=1e-3, maximum=1.0
+    )
+    contact_yaw_std: float = option(
+        0.3, "the same for the yaw of a rectangular end effector", unit="rad", minimum=1e-3, maximum=10.0
+    )
+    smoothness_spread: float = option(
+        0.06, "mean standard deviation of the smoothness prior", unit="m", minimum=1e-4, maximum=10.0
+    )
+    jitter: float = option(
+        0.002,
+        "standard deviation added to the particles at each horizon: a gathered belief says nothing",
+        unit="m",
+        minimum=0.0,
+        maximum=0.1,
+    )
+    particles: int = option(20, "particles of a rollout N_p", minimum=2, maximum=10_000)
+    speed: float = option(
+        0.12, "largest speed of a tool in x and in y", unit="m/s", minimum=0.005, maximum=2.0
+    )
+    acceleration: float = option(
+        0.6, "largest acceleration of a tool in x and in y", unit="m/s^2", minimum=0.01, maximum=20.0
+    )
+    turn_speed: float = option(
+        0.8, "largest yaw rate of a rectangular tool", unit="rad/s", minimum=0.01, maximum=10.0
+    )
+    turn_acceleration: float = option(
+        4.0, "largest yaw acceleration of a rectangular tool", unit="rad/s^2", minimum=0.01, maximum=100.0
+    )
+    joint_speed: float = option(
+        0.3, "largest speed of a joint when planning in joint space", unit="rad/s", minimum=0.01, maximum=5.0
+    )
+    joint_acceleration: float = option(
+        1.5, "the same for its acceleration", unit="rad/s^2", minimum=0.01, maximum=20.0
+    )
+    joint_spread: float = option(
+        0.1, "the same for the smoothness prior's standard deviation", unit="rad", minimum=1e-4, maximum=10.0
+    )
+    height_tolerance: float = option(
+        0.004,
+        "largest deviation of a tool from its height when planning in joint space",
+        unit="m",
+        minimum=1e-4,
+        maximum=0.2,
+    )
+    search: VpstoConfig = dataclasses.field(
+        default_factory=lambda: VpstoConfig(population=30, iterations=10, strategy="cma")
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)

@@ -1,0 +1,200 @@
+"""One horizon of BS-VP-STO (6.4) as a problem for the search: priors, costs and constraints."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.belief.dynamics import BeliefDynamics, BeliefPrediction
+from vpsto_ros.belief.particles import ObjectBelief
+from vpsto_ros.belief.variance import GAIN_TOLERANCE, robustness_costs
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.optimization.progress import Evaluation
+from vpsto_ros.planning.belief_space import scoring
+from vpsto_ros.planning.belief_space.config import RobustPushingConfig
+from vpsto_ros.planning.belief_space.contacts import ContactRule
+from vpsto_ros.planning.belief_space.spaces import SearchSpace
+from vpsto_ros.priors.contact import contact_distribution
+from vpsto_ros.priors.gaussian import GaussianPrior
+from vpsto_ros.priors.smoothness import smoothness_prior
+from vpsto_ros.trajectory import OptimalBasis, Trajectory, TrajectoryBatch, synthesize, synthesize_batch
+
+INVALID_COST = 1e3
+"""Offset that ranks every candidate with a broken constraint behind all others, as lambda_c of eq. (6.33)."""
+
+Reach = Callable[[NDArray], NDArray]
+"""Whether plane coordinates (K, m) are within reach, shape (K,) of bool."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HorizonOutcome:
+    """What candidates do, row by row.
+
+    Attributes:
+        motion: their motions in the search space.
+        paths: plane coordinates, shape (B, K + 1, m).
+        prediction: of the belief.
+        gain: largest variance gain, shape (B,).
+        excess: largest violation of a constraint on the robot [m], shape (B,).
+    """
+
+    motion: TrajectoryBatch
+    paths: NDArray
+    prediction: BeliefPrediction
+    gain: NDArray
+    excess: NDArray
+
+
+class RobustPushingProblem:
+    """Push a belief along a way within one horizon, from a state of the robot.
+
+    The search points are N - 1 via-points and the free final position.
+    """
+
+    def __init__(
+        self,
+        config: RobustPushingConfig,
+        dynamics: BeliefDynamics,
+        space: SearchSpace,
+        rule: ContactRule,
+        *,
+        start: NDArray,
+        velocity: NDArray,
+        belief: ObjectBelief,
+        way: NDArray,
+        reach: Reach | None = None,
+        start_time: float = 0.0,
+    ) -> None:
+        """Pose the problem.
+
+        Args:
+            config: weights and constraints.
+            dynamics: of the belief.
+            space: what is searched.
+            rule: where to touch.
+            start: present position in the search space, shape (n,).
+            velocity: present velocity, shape (n,).
+            belief: present belief.
+            way: where to push the object, see :meth:`Target.way`, shape (L, 3) [m].
+            reach: tells which plane coordinates the arms reach.
+            start_time: time of the start [s].
+        """
+        self.config, self.dynamics, self.space, self.rule = config, dynamics, space, rule
+        self.start, self.velocity, self.start_time = start, velocity, start_time
+        self.belief, self.way, self.reach = belief, np.ascontiguousarray(way, dtype=float), reach
+        self.present = space.plane(np.asarray(start)[None, None])[0][0, 0]
+        self.basis = OptimalBasis.uniform(config.points - 1)
+        crossing = rule.crossing
+        self._arms = (0.0, math.inf) if crossing is None else (crossing.offset, crossing.crossing)
+
+    def evaluate(self, points: NDArray) -> Evaluation:
+        """Costs and validity of candidates (B, N, n): c_task + c_robust, (6.54) and (6.32)."""
+        outcome, config = self.outcome(points), self.config
+        prediction, batch = outcome.prediction, len(points)
+        cost, robust = np.empty(batch), np.zeros(batch)
+        scoring.progress_costs(
+            prediction.mean, prediction.variance, self.way, config.aside_weight if len(self.way) > 1 else 1.0,
+            config.progress_weight, config.variance_weight if config.robust else 0.0, cost,
+        )  # fmt: skip
+        if config.duration_weight > 0.0:
+            cost += config.duration_weight * outcome.motion.duration
+        valid = (outcome.excess <= 0.0) & (prediction.step <= config.longest_step)
+        if config.robust:
+            robustness_costs(
+                prediction.variance, prediction.contact, config.perturbation, robust, outcome.gain
+            )
+            valid &= (outcome.gain <= 1.0 + GAIN_TOLERANCE) & (prediction.wedge >= config.wedge)
+        penalty = np.where(valid, 0.0, INVALID_COST * (1.0 + outcome.excess))
+        return Evaluation(cost + robust + penalty, valid)
+
+    def outcome(self, points: NDArray) -> HorizonOutcome:
+        """Synthesise candidates (B, N, n) and propagate the belief along them."""
+        config = self.config
+        motion = synthesize_batch(
+            self.basis, self._keys(points), self.velocity, np.zeros_like(self.start), self.space.limits,
+            config.steps + 1, derivatives=False,
+        )  # fmt: skip
+        paths, heights = self.space.plane(motion.position)
+        prediction = self.dynamics.predict(self.belief, paths)
+        excess = np.empty(len(points))
+        scoring.separation_excess(
+            self.dynamics.effectors.rows, paths, config.separation, *self._arms, excess,
+        )  # fmt: skip
+        self._add_robot_limits(motion, paths, heights, excess)
+        return HorizonOutcome(motion, paths, prediction, np.empty(len(points)), excess)
+
+    def _add_robot_limits(
+        self, motion: TrajectoryBatch, paths: NDArray, heights: NDArray | None, excess: NDArray
+    ) -> None:
+        """Add what leaves the reach of the arms, position limits or the tools' height."""
+        limits = self.space.limits
+        if limits.lower is not None and limits.upper is not None:
+            beyond = np.maximum(limits.lower - motion.position, motion.position - limits.upper)
+            np.maximum(excess, beyond.max(axis=(1, 2)), out=excess)
+        if heights is not None:
+            worst = np.empty(len(paths))
+            height = self.space.height  # type: ignore[attr-defined]
+            scoring.height_excess(heights, height, self.config.height_tolerance, worst)
+            np.maximum(excess, worst, out=excess)
+        elif self.reach is not None:
+            inside = self.reach(paths.reshape(-1, paths.shape[2])).reshape(paths.shape[:2])
+            np.maximum(excess, 0.1 * (1.0 - inside.mean(axis=1)), out=excess)
+
+    def prior(self) -> GaussianPrior:
+        """Product of the smoothness prior and the contact prior, eq. (6.49)."""
+        config = self.config
+        contact = self.rule.configuration(self.belief.mean, self._direction(), self.present)
+        way = float(np.abs(contact - self.present).max())
+        prior = smoothness_prior(
+            self.basis, self.start, self.velocity, None, np.zeros_like(self.start),
+            max(way / config.speed, 0.3), weights=self.space.weights, spread=self.space.spread,
+        )  # fmt: skip
+        if not config.contact_prior:
+            return prior
+        mean, covariance = contact_distribution(
+            contact, self.rule.jacobian(), self.belief.covariance, self._contact_covariance()
+        )
+        return prior.times(*self.space.factor(config.points, mean, covariance, self.present))
+
+    def trajectory(self, points: NDArray) -> Trajectory:
+        """The timed motion of one candidate (N, n) in the search space; it ends at rest."""
+        return synthesize(
+            self.basis, self._keys(points[None])[0], self.velocity, np.zeros_like(self.start),
+            self.space.limits, start_time=self.start_time,
+        )  # fmt: skip
+
+    def _direction(self) -> NDArray:
+        """Unit vector from the belief's mean to the end of the way; along x where they coincide."""
+        way = self.way[-1, :2] - self.belief.mean[:2]
+        length = math.hypot(*way)
+        return way / length if length > 1e-6 else np.array([1.0, 0.0])
+
+    def _contact_covariance(self) -> NDArray:
+        effectors, config = self.dynamics.effectors, self.config
+        std = np.full(effectors.dof, config.contact_std)
+        for column, turns in zip(effectors.columns, effectors.rows[:, 5] > 0.0, strict=True):
+            if turns:
+                std[column + 2] = config.contact_yaw_std
+        return np.diag(std**2)
+
+    def _keys(self, points: NDArray) -> NDArray:
+        start = np.broadcast_to(self.start, (len(points), 1, points.shape[2]))
+        return np.concatenate([start, points], axis=1)
+
+
+def require_free(dynamics: BeliefDynamics, belief: ObjectBelief, point: NDArray) -> None:
+    """Raise InvalidInputError when the expected object is in deep penetration with an end effector.
+
+    Some millimetres are what an uncertain estimate of a touched object may say; more means that robot or
+    object are not where they are thought to be.
+    """
+    gaps = dynamics.effectors.gaps(dynamics.shape, belief.mean, point)
+    worst = int(np.argmin(gaps))
+    allowed = 0.01 + 2.0 * math.sqrt(belief.variance)
+    if gaps[worst] < -allowed:
+        raise InvalidInputError(
+            f"end effector {worst + 1} of {len(gaps)} penetrates the object by {-1e3 * gaps[worst]:.1f} mm "
+            f"at the start; at most {1e3 * allowed:.1f} mm can be blamed on the belief's spread"
+        )
