@@ -26,7 +26,8 @@ from vpsto_ros.nodes.scene import goal_on_table
 from vpsto_ros.nodes.sent_plans import AT_REST, JointSample, SentPlans, follows, runs_on, stop_from
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.pushing import MpcStep, PushingMpc
+from vpsto_ros.planning.pushing import PushingMpc
+from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.robot.kinematics import fr3_pusher
 
 STOP_PATIENCE = 1.0
@@ -197,7 +198,7 @@ class MpcPlannerNode(ManagedNode):
         if joints is not None:
             self.complaints.add("joint_states_age", message)
         self.last = MpcStep(None, "wait", False, message)
-        self.planner.online.accept(None)
+        self.planner.forget_plan()
         return False
 
     def _step(self, now: float, begin: float) -> MpcStep | None:

@@ -16,58 +16,23 @@ from numpy.typing import NDArray
 
 from vpsto_ros.contact.pushing import PushingModel, rollout
 from vpsto_ros.estimation.object_state import ObjectState
-from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, VpstoError
+from vpsto_ros.exceptions import ConfigurationError, InfeasibleError
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.mpc import OnlineResult, OnlineVpsto
 from vpsto_ros.planning.pushes import PushRanking
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
 from vpsto_ros.planning.pushing_problem import PushingProblem
-from vpsto_ros.planning.stitching import extended, resting
+from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
+from vpsto_ros.planning.stitching import resting
 from vpsto_ros.planning.table_entry import enter_plane
 from vpsto_ros.planning.table_path import TablePath
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import Robot
 from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory
 
-AT_REST = 0.02
-"""Joint speed below which the arm counts as standing [rad/s]."""
 
-
-@dataclasses.dataclass(frozen=True)
-class MpcStep:
-    """Outcome of one planning step.
-
-    Attributes:
-        trajectory: joint trajectory in absolute time, to replace what is being executed, or None when there
-            is nothing to execute. It begins
-            with what is left of the running one until the new plan takes over and ends at rest.
-        mode: "explore", "warm_start", "stop" (no via-points), "hold" (goal reached), "brake" (no valid plan),
-            "enter" (on
-            the way into the plane), "wait" (not ready).
-        valid: whether it is a plan that works, as opposed to a safe stop.
-        message: what happened, in words, for people.
-        cost: cost of the plan [s], inf without one.
-        tool_path: planned tool positions, shape (K, 2) [m].
-        object_path: predicted object poses, shape (K, 3).
-        iterations: iterations of the search.
-        plane: solution in the plane, for the next warm start.
-        ready_at: nothing is planned before this time [s].
-    """
-
-    trajectory: Trajectory | None
-    mode: str
-    valid: bool
-    message: str
-    cost: float = np.inf
-    tool_path: NDArray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
-    object_path: NDArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    iterations: int = 0
-    plane: Trajectory | None = None
-    ready_at: float = -np.inf
-
-
-class PushingMpc:
+class PushingMpc(ReferencePlanner):
     """Plans, 20 to 50 times a second, how the arm pushes an object to a goal."""
 
     def __init__(
@@ -89,7 +54,8 @@ class PushingMpc:
         the joint trajectory is then slower than the plane motion (see :class:`TablePath`), and the step's
         message says so.
         """
-        self.config, self.model, self.robot = config, model, robot
+        super().__init__(robot, config.lead, config.joint_tolerance, config.object_timeout)
+        self.config, self.model = config, model
         table_map = TableMap(robot, config.tool_height)
         _check_workspace(config, table_map)
         self.table_path = TablePath(robot, table_map)
@@ -101,18 +67,13 @@ class PushingMpc:
 
     def reset(self) -> None:
         """Forget everything about the running motion, as after a restart of the robot's driver."""
-        self.reference: Trajectory | None = None
+        super().reset()
         self.tool_offset = np.zeros(2)
         self.holding = False
-        self.ready_at = -np.inf
-        self.online.accept(None)
 
-    @property
-    def _running(self) -> Trajectory:
-        """The reference that is being followed, once there is one."""
-        if self.reference is None:
-            raise VpstoError("the planner has not taken over an arm yet")
-        return self.reference
+    def forget_plan(self) -> None:
+        """Do not warm-start from the last plan."""
+        self.online.accept(None)
 
     @property
     def table_map(self) -> TableMap:
@@ -162,20 +123,9 @@ class PushingMpc:
 
     def accept(self, step: MpcStep) -> None:
         """Take note that a step's trajectory is being executed."""
+        super().accept(step)
         if step.trajectory is not None:
-            self.reference = self._with_past(step.trajectory)
             self.online.accept(step.plane)
-            self.ready_at = step.ready_at
-
-    def stop(self, now: float) -> Trajectory | None:
-        """The quickest stop within the joint limits, to be executed at once; None if nothing moves."""
-        if self.reference is None:
-            return None
-        position, velocity, _ = self.reference.state(now)
-        self.online.accept(None)
-        brake = extended(braking_trajectory(position, velocity, self.robot.limits, start_time=now), now + 0.5)
-        self.reference = self._with_past(brake)
-        return brake
 
     def warm_up(self) -> None:
         """Compile every kernel by planning once for an imaginary object."""
@@ -196,23 +146,6 @@ class PushingMpc:
                 )
             self.stop(0.5)
             self.reset()
-
-    def _lost(self, now: float, joint_position: NDArray) -> bool:
-        """Whether the arm is not where the running reference says."""
-        if self.reference is None:
-            return True
-        return bool(np.abs(self.reference(now) - joint_position).max() > self.config.joint_tolerance)
-
-    def _reference_moves(self, now: float) -> bool:
-        return self.reference is not None and np.abs(self.reference(now + self.config.lead, 1)).max() > 1e-6
-
-    def _with_past(self, trajectory: Trajectory) -> Trajectory:
-        """A trajectory preceded by what was executed before it, as far back as an object state may date."""
-        if self.reference is None or self.reference.start_time >= trajectory.start_time:
-            return trajectory
-        begin = max(self.reference.start_time, trajectory.start_time - self.config.object_timeout)
-        past = extended(self.reference, trajectory.start_time).clipped(begin, trajectory.start_time)
-        return past.followed_by(trajectory)
 
     def _begin(self, now: float, position: NDArray, velocity: NDArray, state: ObjectState | None) -> MpcStep:
         """Take over an arm that stands still; one that is not in the plane is moved there first."""
@@ -346,14 +279,6 @@ class PushingMpc:
         except InfeasibleError:
             joints = braking_trajectory(position, velocity, self.robot.limits, start_time=takeover)
         return MpcStep(self._joined(now, joints), mode, valid, message)
-
-    def _joined(self, now: float, joints: Trajectory) -> Trajectory:
-        """The running reference until the new motion takes over, then the new motion."""
-        running = extended(self._running, joints.start_time)
-        begin = max(now, running.start_time)
-        if joints.start_time - begin < 1e-6:
-            return joints
-        return running.clipped(begin, joints.start_time).followed_by(joints)
 
 
 def _check_workspace(config: PushingMpcConfig, table_map: TableMap) -> None:

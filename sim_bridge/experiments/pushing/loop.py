@@ -21,8 +21,9 @@ from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.estimation.planar_kalman import PlanarKalman
 from vpsto_ros.planning.contact import ContactPlannerConfig, PushContactPlanner
 from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.pushing import MpcStep, PushingMpc
+from vpsto_ros.planning.pushing import PushingMpc
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
+from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.robot.kinematics import forward_kinematics_batch, fr3_pusher
 from vpsto_ros.trajectory import Trajectory
 

@@ -9,8 +9,9 @@ from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.planning.mpc import OnlineResult
 from vpsto_ros.planning.pushes import around
-from vpsto_ros.planning.pushing import MpcStep, PushingMpc
+from vpsto_ros.planning.pushing import PushingMpc
 from vpsto_ros.planning.pushing_problem import PushingProblem
+from vpsto_ros.planning.running_reference import MpcStep
 
 ALIGNED = 0.008
 """Sideways distance from the line through the box and the goal within which the script pushes [m]."""

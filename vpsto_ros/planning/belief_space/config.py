@@ -2,7 +2,10 @@
 
 import dataclasses
 
+from numpy.typing import NDArray
+
 from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.optimization.vpsto import VpstoConfig
 
 
@@ -105,3 +108,71 @@ class RobustPushingConfig:
 
     def __post_init__(self) -> None:
         validate(self)
+
+
+@documented
+@dataclasses.dataclass(frozen=True)
+class RobustMpcConfig:
+    """Options of robust pushing in closed loop."""
+
+    lead: float = option(
+        0.05,
+        "time between the start of planning and the moment the plan takes over",
+        unit="s",
+        minimum=0.005,
+        maximum=1.0,
+    )
+    hold_distance: float = option(
+        0.008, "the goal counts as reached, and the arms rest, within", unit="m", minimum=1e-4, maximum=0.5
+    )
+    resume_distance: float = option(
+        0.012,
+        "resting arms resume when the expected object is farther off than",
+        unit="m",
+        minimum=1e-4,
+        maximum=0.5,
+    )
+    largest_std: float = option(
+        0.06,
+        "the arms stop when the belief's standard deviation is larger: the object is lost",
+        unit="m",
+        minimum=1e-3,
+        maximum=1.0,
+    )
+    joint_tolerance: float = option(
+        0.06,
+        "the plan is begun anew when a joint is farther from its reference",
+        unit="rad",
+        minimum=1e-3,
+        maximum=1.0,
+    )
+    object_timeout: float = option(
+        0.5, "the arms stop when the belief is older", unit="s", minimum=0.02, maximum=10.0
+    )
+    workspace_x: tuple[float, float] = option(
+        (0.36, 0.64), "range of goals and objects in x", unit="m", minimum=-2.0, maximum=2.0
+    )
+    workspace_y: tuple[float, float] = option(
+        (-0.25, 0.25), "range of goals and objects in y", unit="m", minimum=-2.0, maximum=2.0
+    )
+    planning: RobustPushingConfig = dataclasses.field(
+        default_factory=lambda: RobustPushingConfig(
+            search=VpstoConfig(population=30, iterations=10, strategy="cma")
+        )
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+        if self.resume_distance < self.hold_distance:
+            raise ConfigurationError(
+                f"resume_distance = {self.resume_distance} is below hold_distance = {self.hold_distance}"
+            )
+        for name in ("workspace_x", "workspace_y"):
+            low, high = getattr(self, name)
+            if low >= high:
+                raise ConfigurationError(f"{name} = {low}, {high}: the first must be below the second")
+
+    def contains(self, position: NDArray) -> bool:
+        """Whether a position (2,) is where goals and objects may be."""
+        (x_low, x_high), (y_low, y_high) = self.workspace_x, self.workspace_y
+        return bool(x_low <= position[0] <= x_high and y_low <= position[1] <= y_high)

@@ -66,6 +66,7 @@ class RobustPushingProblem:
         way: NDArray,
         reach: Reach | None = None,
         start_time: float = 0.0,
+        contact: tuple[NDArray, NDArray] | None = None,
     ) -> None:
         """Pose the problem.
 
@@ -80,12 +81,14 @@ class RobustPushingProblem:
             way: where to push the object, see :meth:`Target.way`, shape (L, 3) [m].
             reach: tells which plane coordinates the arms reach.
             start_time: time of the start [s].
+            contact: mean (m,) and covariance (m, m) of the plane coordinates in contact, (6.38), as somebody
+                else plans them; None: by the rule.
         """
         self.config, self.dynamics, self.space, self.rule = config, dynamics, space, rule
         self.start, self.velocity, self.start_time = start, velocity, start_time
         self.belief, self.way, self.reach = belief, np.ascontiguousarray(way, dtype=float), reach
         self.present = space.plane(np.asarray(start)[None, None])[0][0, 0]
-        self.basis = OptimalBasis.uniform(config.points - 1)
+        self.basis, self.contact = OptimalBasis.uniform(config.points - 1), contact or self._contact()
         crossing = rule.crossing
         self._arms = (0.0, math.inf) if crossing is None else (crossing.offset, crossing.crossing)
 
@@ -145,17 +148,14 @@ class RobustPushingProblem:
     def prior(self) -> GaussianPrior:
         """Product of the smoothness prior and the contact prior, eq. (6.49)."""
         config = self.config
-        contact = self.rule.configuration(self.belief.mean, self._direction(), self.present)
-        way = float(np.abs(contact - self.present).max())
+        mean, covariance = self.contact
+        way = float(np.abs(mean - self.present).max())
         prior = smoothness_prior(
             self.basis, self.start, self.velocity, None, np.zeros_like(self.start),
             max(way / config.speed, 0.3), weights=self.space.weights, spread=self.space.spread,
         )  # fmt: skip
         if not config.contact_prior:
             return prior
-        mean, covariance = contact_distribution(
-            contact, self.rule.jacobian(), self.belief.covariance, self._contact_covariance()
-        )
         return prior.times(*self.space.factor(config.points, mean, covariance, self.present))
 
     def trajectory(self, points: NDArray) -> Trajectory:
@@ -170,6 +170,13 @@ class RobustPushingProblem:
         way = self.way[-1, :2] - self.belief.mean[:2]
         length = math.hypot(*way)
         return way / length if length > 1e-6 else np.array([1.0, 0.0])
+
+    def _contact(self) -> tuple[NDArray, NDArray]:
+        """Where to touch, eq. (6.38)."""
+        contact = self.rule.configuration(self.belief.mean, self._direction(), self.present)
+        return contact_distribution(
+            contact, self.rule.jacobian(), self.belief.covariance, self._contact_covariance()
+        )
 
     def _contact_covariance(self) -> NDArray:
         effectors, config = self.dynamics.effectors, self.config

@@ -1,8 +1,8 @@
 """Receding-horizon BS-VP-STO, Algorithm 3: long pushes as a sequence of robust horizons.
 
 Each horizon is one search. Offline the belief is then carried on by a noisy rollout; online an estimator
-does that. A horizon without any valid candidate is not executed: the robot brakes, and the next horizon begins
-from there.
+does that. A horizon without any valid candidate is not executed: the robot brakes, and the next horizon
+begins from there.
 """
 
 import dataclasses
@@ -106,6 +106,7 @@ class RobustPusher:
         *,
         start_time: float = 0.0,
         previous: Trajectory | None = None,
+        contact: tuple[NDArray, NDArray] | None = None,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> Horizon:
@@ -118,16 +119,15 @@ class RobustPusher:
             way: where to push the object, see :meth:`Target.way`, shape (L, 3) [m].
             start_time: when the horizon begins [s].
             previous: what was planned before; what is left of it is one more candidate.
+            contact: where to touch, see :class:`RobustPushingProblem`.
             deadline: value of `clock` by which to be back.
             clock: reads the time.
-
-        Raises:
-            InvalidInputError: robot and object penetrate each other.
         """
         config = self.config
         problem = RobustPushingProblem(
             config, self.dynamics, self.space, self.rule, start=start, velocity=velocity,
             belief=self._planning_belief(belief), way=way, reach=self.reach, start_time=start_time,
+            contact=contact,
         )  # fmt: skip
         result = search(
             problem.prior(), problem.evaluate, config.search, self.rng,
@@ -160,6 +160,9 @@ class RobustPusher:
             horizons: how many are planned at most.
             start_time: when the motion begins [s].
             report: called with what is left to push [m] after every horizon.
+
+        Raises:
+            InvalidInputError: robot and object penetrate each other at the start.
         """
         require_free(self.dynamics, belief, self.space.plane(np.asarray(start)[None, None])[0][0, 0])
         began, q, dynamics = time.perf_counter(), np.asarray(start, dtype=float), self.dynamics

@@ -1,0 +1,260 @@
+"""Robust pushing in closed loop (6.6.4): one horizon per cycle, the belief from a particle filter.
+
+The search runs in the plane of the tools; joint trajectories follow it exactly. The last horizon goes on
+until the new one takes over; what is left of it is a candidate of the new search.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.belief.dynamics import BeliefDynamics
+from vpsto_ros.belief.particles import ObjectBelief
+from vpsto_ros.exceptions import ConfigurationError, InfeasibleError
+from vpsto_ros.planning.belief_space.config import RobustMpcConfig
+from vpsto_ros.planning.belief_space.contacts import ContactRule
+from vpsto_ros.planning.belief_space.receding_horizon import Horizon, RobustPusher
+from vpsto_ros.planning.belief_space.spaces import PlaneSpace
+from vpsto_ros.planning.belief_space.targets import Target
+from vpsto_ros.planning.plane_path import follow_plane
+from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
+from vpsto_ros.planning.stitching import resting
+from vpsto_ros.robot.tool_plane import ToolPlane
+from vpsto_ros.trajectory import Trajectory, braking_trajectory
+
+_BELIEF_STEP = 0.02  # time between samples of the reference when a belief is carried on [s]
+_MODES = {True: "robust", False: "deterministic"}
+
+
+@dataclasses.dataclass(frozen=True)
+class StampedBelief:
+    """A belief and the time it is of [s]."""
+
+    stamp: float
+    belief: ObjectBelief
+
+
+class RobustPushingMpc(ReferencePlanner):
+    """Plans, 20 times a second and more, how tools push an uncertain object to a goal or along a path.
+
+    Attributes:
+        config: options; with ``planning.robust = False`` it is the deterministic controller of 6.6.4.
+        pusher: plans single horizons.
+        tools: the plane of the tools.
+        prediction: what the last search predicts of the belief, None if there was none.
+    """
+
+    def __init__(
+        self,
+        config: RobustMpcConfig,
+        dynamics: BeliefDynamics,
+        tools: ToolPlane,
+        rule: ContactRule,
+        rng: np.random.Generator,
+    ) -> None:
+        """Set up the planner.
+
+        Args:
+            config: options.
+            dynamics: of the belief.
+            tools: the robot's tools in their plane.
+            rule: where to touch.
+            rng: source of all randomness.
+
+        Raises:
+            ConfigurationError: end effectors and tools do not fit together.
+        """
+        super().__init__(tools.robot, config.lead, config.joint_tolerance, config.object_timeout)
+        if dynamics.effectors.dof != tools.dof:
+            raise ConfigurationError(
+                f"the end effectors have {dynamics.effectors.dof} plane coordinates, the robot's tools "
+                f"{tools.dof}; the rod has 2, the hand 3, two balls 4"
+            )
+        space = PlaneSpace(dynamics.effectors, config.planning)
+        self.config, self.tools, self.rng = config, tools, rng
+        self.pusher = RobustPusher(config.planning, dynamics, space, rule, rng, reach=tools.contains)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything about the running motion, as after a restart of the robot's driver."""
+        super().reset()
+        self.holding, self._progress = False, 0.0
+        self._target: Target | None = None
+        self.prediction: NDArray = np.zeros((0, 2))
+
+    def forget_plan(self) -> None:
+        """Do not warm-start from the last plan."""
+        self._plane: Trajectory | None = None
+
+    def accept(self, step: MpcStep) -> None:
+        """Take note that a step's trajectory is being executed."""
+        super().accept(step)
+        if step.trajectory is not None:
+            self._plane = step.plane
+
+    def step(
+        self,
+        now: float,
+        joint_position: NDArray,
+        joint_velocity: NDArray,
+        belief: StampedBelief | None,
+        target: Target | None,
+        contact: tuple[NDArray, NDArray] | None = None,
+        *,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> MpcStep:
+        """Plan once. Call :meth:`accept` when the trajectory has been sent to the robot.
+
+        Args:
+            now: present time [s].
+            joint_position: measured joint positions, shape (n,) [rad].
+            joint_velocity: measured joint velocities, shape (n,) [rad/s].
+            belief: latest belief over the object, None if there is none.
+            target: where to push it, None if nobody said.
+            contact: where to touch, as mean (m,) and covariance (m, m) of the plane coordinates; None: by the
+                planner's own rule.
+            deadline: value of `clock` at which to return the best found so far.
+            clock: source of that time.
+        """
+        if self._lost(now, joint_position):
+            if self._reference_moves(now):
+                return self._stop(now, "brake", "the arms do not follow their reference; stopping first")
+            return self._begin(now, joint_position, joint_velocity)
+        if now + self.config.lead < self.ready_at:
+            return MpcStep(None, "wait", False, "about to begin")
+        problem = self._reason_to_stop(now, belief, target)
+        if problem or belief is None or target is None:
+            return self._stop(now, "brake", problem)
+        ahead = self._carried(belief, now + self.config.lead)
+        if self._reached(target, ahead):
+            return self._stop(now, "hold", "the object is at its goal", valid=True)
+        position, velocity = self._tools_at(now + self.config.lead)
+        horizon = self.pusher.horizon(
+            position, velocity, ahead, target.way(self._progress), start_time=now + self.config.lead,
+            previous=self._plane, contact=contact, deadline=deadline, clock=clock,
+        )  # fmt: skip
+        if not horizon.valid:
+            return self._stop(now, "brake", "no valid plan found")
+        try:
+            return self._joint_step(now, horizon)
+        except InfeasibleError as error:
+            return self._stop(now, "brake", f"plan refused: {error}")
+
+    def warm_up(self) -> None:
+        """Compile every kernel by planning once for an imaginary object."""
+        (low_x, high_x), (low_y, high_y) = self.config.workspace_x, self.config.workspace_y
+        pose = np.array([0.5 * (low_x + high_x), 0.5 * (low_y + high_y), 0.0])
+        belief = ObjectBelief.gaussian(pose, 0.003, self.config.planning.particles, np.random.default_rng(0))
+        start = self.pusher.rule.configuration(pose, np.array([1.0, 0.0]), np.zeros(self.tools.dof))
+        start[0::2] -= 0.1 if self.tools.dof != 3 else 0.0
+        horizon = self.pusher.horizon(start, np.zeros(self.tools.dof), belief, np.array([[*pose[:2], 0.0]]))
+        follow_plane(horizon.trajectory, self.tools)
+        self._carried_along(belief, np.stack([start, start]))
+
+    def _begin(self, now: float, position: NDArray, velocity: NDArray) -> MpcStep:
+        """Take over arms that stand still with their tools in the plane."""
+        self.reset()
+        if np.abs(velocity).max() > AT_REST:
+            return MpcStep(None, "wait", False, "the arms move but not by this planner's reference")
+        point = self.tools.tool(position)
+        deviation = np.abs(self.tools.tool_heights(position) - self.tools.height).max()
+        if deviation > 0.01 or not self.tools.contains(point[None])[0]:
+            return MpcStep(
+                None, "wait", False,
+                f"the tools are {1e3 * deviation:.0f} mm off their height or out of reach; move them to "
+                f"{self.tools.height:.3f} m above the table first",
+            )  # fmt: skip
+        start = now + 4.0 * self.config.lead
+        upright = self.tools.joints(point[None])[0]
+        if np.abs(upright - position).max() > self.config.joint_tolerance:
+            return MpcStep(None, "wait", False, "the tools are in their plane but not upright")
+        return MpcStep(
+            resting(position, start, start + 0.5), "wait", False, "took over the arms where they stand",
+            ready_at=start,
+        )  # fmt: skip
+
+    def _reason_to_stop(self, now: float, belief: StampedBelief | None, target: Target | None) -> str:
+        config = self.config
+        if target is None:
+            return "no goal yet"
+        if belief is None:
+            return "no belief over the object yet"
+        if now - belief.stamp > config.object_timeout:
+            return (
+                f"the belief over the object is {now - belief.stamp:.2f} s old (allowed "
+                f"{config.object_timeout:.2f} s)"
+            )
+        spread = float(np.sqrt(belief.belief.variance))
+        if spread > config.largest_std:
+            return (
+                f"the object is lost: the belief's standard deviation is {1e3 * spread:.0f} mm "
+                f"(allowed {1e3 * config.largest_std:.0f} mm)"
+            )
+        if not config.contains(belief.belief.mean):
+            x, y, _ = belief.belief.mean
+            return f"the object at ({x:.3f}, {y:.3f}) m is outside the workspace"
+        return ""
+
+    def _carried(self, belief: StampedBelief, when: float) -> ObjectBelief:
+        """The belief at a later time, pushed along by the running reference."""
+        begin = max(min(belief.stamp, when), self._running.start_time)
+        count = max(2, int(np.ceil((when - begin) / _BELIEF_STEP)) + 1)
+        times = np.minimum(np.linspace(begin, when, count), self._running.end_time)
+        return self._carried_along(belief.belief, self.tools.tool(self._running(times)))
+
+    def _carried_along(self, belief: ObjectBelief, path: NDArray) -> ObjectBelief:
+        return self.pusher.dynamics.simulate(belief, path, self.rng).belief
+
+    def _reached(self, target: Target, belief: ObjectBelief) -> bool:
+        """Hysteresis: rest within the hold distance until the object is beyond the resume distance."""
+        if target is not self._target:
+            self._target, self._progress, self.holding = target, 0.0, False
+        self._progress = target.advanced(self._progress, belief.mean[:2])
+        left = target.remaining(self._progress, belief.mean[:2])
+        self.holding = left <= (self.config.resume_distance if self.holding else self.config.hold_distance)
+        return self.holding
+
+    def _tools_at(self, when: float) -> tuple[NDArray, NDArray]:
+        """Plane coordinates and their rates of the reference, within the planner's limits."""
+        position, velocity, _ = self._running.state(when)
+        most = self.pusher.space.limits.velocity
+        rates = np.clip(self.tools.tool_velocity(position, velocity), -most, most)
+        return self.tools.tool(position), rates
+
+    def _joint_step(self, now: float, horizon: Horizon) -> MpcStep:
+        plane, start = horizon.trajectory, horizon.trajectory.start_time
+        followed = follow_plane(plane, self.tools)
+        moving = np.abs(plane(start, 1)).max() > 1e-6
+        if followed.stretch > 1.0 and moving:
+            raise InfeasibleError(f"the joints' limits ask for a motion {followed.stretch:.2f} times slower")
+        result = horizon.result
+        assert result.points is not None
+        outcome = horizon.problem.outcome(result.points[None])
+        path = outcome.prediction.mean[0]
+        self.prediction = np.column_stack([path[:, :2], np.zeros(len(path))])
+        return MpcStep(
+            self._joined(now, followed.trajectory), _MODES[self.config.planning.robust], True, "pushing",
+            result.cost, outcome.paths[0], self.prediction, result.iterations,
+            plane if followed.stretch == 1.0 else None,
+        )  # fmt: skip
+
+    def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
+        """Come to rest in the plane at constant deceleration."""
+        takeover = now + self.config.lead
+        position, velocity, _ = self._running.state(takeover)
+        if np.abs(velocity).max() < 1e-6:
+            rest = resting(position, takeover, takeover + 0.5)
+            return MpcStep(self._joined(now, rest), mode, valid, message)
+        brake = braking_trajectory(*self._tools_at(takeover), self.pusher.space.limits, start_time=takeover)
+        try:
+            followed = follow_plane(brake, self.tools)
+            joints = followed.trajectory
+            if followed.stretch > 1.0:
+                raise InfeasibleError("slower")
+        except InfeasibleError:
+            joints = braking_trajectory(position, velocity, self.robot.limits, start_time=takeover)
+        return MpcStep(self._joined(now, joints), mode, valid, message)

@@ -1,0 +1,126 @@
+"""What every planner that replans while the arm moves needs: the reference that the arm follows.
+
+A new plan takes over a moment after planning began; until then the arm goes on with the old one, and the
+published trajectory begins with what is left of it.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.exceptions import VpstoError
+from vpsto_ros.planning.stitching import extended
+from vpsto_ros.robot.kinematics import Robot
+from vpsto_ros.trajectory import Trajectory, braking_trajectory
+
+AT_REST = 0.02
+"""Joint speed below which the arm counts as standing [rad/s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MpcStep:
+    """Outcome of one planning step.
+
+    Attributes:
+        trajectory: joint trajectory in absolute time, to replace what is being executed, or None when there
+            is nothing to execute. It begins
+            with what is left of the running one until the new plan takes over and ends at rest.
+        mode: "explore", "warm_start", "stop" (no via-points), "hold" (goal reached), "brake" (no valid plan),
+            "enter" (on
+            the way into the plane), "wait" (not ready).
+        valid: whether it is a plan that works, as opposed to a safe stop.
+        message: what happened, in words, for people.
+        cost: cost of the plan [s], inf without one.
+        tool_path: planned tool positions, shape (K, 2) [m].
+        object_path: predicted object poses, shape (K, 3).
+        iterations: iterations of the search.
+        plane: solution in the plane, for the next warm start.
+        ready_at: nothing is planned before this time [s].
+    """
+
+    trajectory: Trajectory | None
+    mode: str
+    valid: bool
+    message: str
+    cost: float = np.inf
+    tool_path: NDArray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
+    object_path: NDArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    iterations: int = 0
+    plane: Trajectory | None = None
+    ready_at: float = -np.inf
+
+
+class ReferencePlanner:
+    """Keeps the reference that is being followed, joins new motions to it, and stops it."""
+
+    def __init__(self, robot: Robot, lead: float, joint_tolerance: float, memory: float) -> None:
+        """Nothing is being followed yet.
+
+        Args:
+            robot: the arm.
+            lead: time between the start of planning and the moment a plan takes over [s].
+            joint_tolerance: how far a joint may be from its reference [rad].
+            memory: how far back the reference is kept [s].
+        """
+        self.robot = robot
+        self._lead, self._joint_tolerance, self._memory = lead, joint_tolerance, memory
+        self.reference: Trajectory | None = None
+        self.ready_at = -np.inf
+
+    def reset(self) -> None:
+        """Forget everything about the running motion, as after a restart of the robot's driver."""
+        self.reference = None
+        self.ready_at = -np.inf
+        self.forget_plan()
+
+    def forget_plan(self) -> None:
+        """Do not warm-start from the last plan."""
+
+    def accept(self, step: MpcStep) -> None:
+        """Take note that a step's trajectory is being executed."""
+        if step.trajectory is not None:
+            self.reference = self._with_past(step.trajectory)
+            self.ready_at = step.ready_at
+
+    def stop(self, now: float) -> Trajectory | None:
+        """The quickest stop within the joint limits, to be executed at once; None if nothing moves."""
+        if self.reference is None:
+            return None
+        position, velocity, _ = self.reference.state(now)
+        self.forget_plan()
+        brake = extended(braking_trajectory(position, velocity, self.robot.limits, start_time=now), now + 0.5)
+        self.reference = self._with_past(brake)
+        return brake
+
+    @property
+    def _running(self) -> Trajectory:
+        """The reference that is being followed, once there is one."""
+        if self.reference is None:
+            raise VpstoError("the planner has not taken over an arm yet")
+        return self.reference
+
+    def _lost(self, now: float, joint_position: NDArray) -> bool:
+        """Whether the arm is not where the running reference says."""
+        if self.reference is None:
+            return True
+        return bool(np.abs(self.reference(now) - joint_position).max() > self._joint_tolerance)
+
+    def _reference_moves(self, now: float) -> bool:
+        return self.reference is not None and np.abs(self.reference(now + self._lead, 1)).max() > 1e-6
+
+    def _with_past(self, trajectory: Trajectory) -> Trajectory:
+        """A trajectory preceded by what was executed before it, as far back as an object state may date."""
+        if self.reference is None or self.reference.start_time >= trajectory.start_time:
+            return trajectory
+        begin = max(self.reference.start_time, trajectory.start_time - self._memory)
+        past = extended(self.reference, trajectory.start_time).clipped(begin, trajectory.start_time)
+        return past.followed_by(trajectory)
+
+    def _joined(self, now: float, joints: Trajectory) -> Trajectory:
+        """The running reference until the new motion takes over, then the new motion."""
+        running = extended(self._running, joints.start_time)
+        begin = max(now, running.start_time)
+        if joints.start_time - begin < 1e-6:
+            return joints
+        return running.clipped(begin, joints.start_time).followed_by(joints)
