@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.contact.geometry import Disc, PlanarShape, Rectangle
+from vpsto_ros.contact.multi_tool import tool_gaps
 from vpsto_ros.exceptions import InvalidInputError
 
 
@@ -94,12 +95,15 @@ class EndEffectors:
         """Signed distances (E,) [m] between an object of this shape at a pose (3,) and the end effectors.
 
         Exact for discs; between rectangles a lower bound where corners face each other.
-        """
-        from vpsto_ros.contact.multi_tool import tool_gaps
 
+        Raises:
+            InvalidInputError: pose or plane coordinates (m,) have another shape.
+        """
+        pose, point = np.asarray(pose, dtype=float), np.asarray(point, dtype=float)
+        if pose.shape != (3,):
+            raise InvalidInputError(f"pose must have shape (3,), got {pose.shape}")
+        if point.shape != (self.dof,):
+            raise InvalidInputError(f"plane coordinates must have shape ({self.dof},), got {point.shape}")
         gaps = np.empty(self.count)
-        tool_gaps(
-            shape.kernel_rows, shape.outline_segments, self.rows,
-            np.asarray(pose, dtype=float), np.asarray(point, dtype=float), gaps,
-        )  # fmt: skip
+        tool_gaps(shape.kernel_rows, shape.outline_segments, self.rows, pose, point, gaps)
         return gaps
