@@ -25,6 +25,13 @@ class RobustPushingConfig:
     progress_weight: float = option(
         30.0, "lambda of the progress cost (6.54)", unit="1/m", minimum=0.1, maximum=1e4
     )
+    distance_weight: float = option(
+        0.0,
+        "cost of a metre that is left at the end: a single horizon needs it, (6.54) being flat there",
+        unit="1/m",
+        minimum=0.0,
+        maximum=1e4,
+    )
     variance_weight: float = option(
         4.0,
         "w of the distance sqrt(|mean - goal|^2 + w V) whose decrease is the progress; 0 is the thesis's",

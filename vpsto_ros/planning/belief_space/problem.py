@@ -97,10 +97,17 @@ class RobustPushingProblem:
         outcome, config = self.outcome(points), self.config
         prediction, batch = outcome.prediction, len(points)
         cost, robust = np.empty(batch), np.zeros(batch)
+        aside = config.aside_weight if len(self.way) > 1 else 1.0
+        variance_weight = config.variance_weight if config.robust else 0.0
         scoring.progress_costs(
-            prediction.mean, prediction.variance, self.way, config.aside_weight if len(self.way) > 1 else 1.0,
-            config.progress_weight, config.variance_weight if config.robust else 0.0, cost,
+            prediction.mean, prediction.variance, self.way, aside, config.progress_weight, variance_weight,
+            cost,
         )  # fmt: skip
+        if config.distance_weight > 0.0:
+            scoring.distance_costs(
+                prediction.mean, prediction.variance, self.way, aside, config.distance_weight,
+                variance_weight, cost,
+            )  # fmt: skip
         if config.duration_weight > 0.0:
             cost += config.duration_weight * outcome.motion.duration
         valid = (outcome.excess <= 0.0) & (prediction.step <= config.longest_step)

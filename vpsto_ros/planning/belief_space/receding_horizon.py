@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.belief.particles import ObjectBelief
+from vpsto_ros.exceptions import InfeasibleError
 from vpsto_ros.optimization.progress import SearchResult
 from vpsto_ros.optimization.vpsto import search
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
@@ -174,7 +175,10 @@ class RobustPusher:
         motion: Trajectory | None = None
         progress, previous, now = target.advanced(0.0, belief.mean[:2]), None, start_time
         while not target.reached(progress, belief) and history.horizons < horizons:
-            step = self.horizon(q, qd, belief, target.way(progress), start_time=now, previous=previous)
+            try:
+                step = self.horizon(q, qd, belief, target.way(progress), start_time=now, previous=previous)
+            except InfeasibleError:  # no arm reaches a place to touch the object any more
+                break
             end = now + max(step.execute, 1e-3)
             piece = step.trajectory.clipped(now, min(end, step.trajectory.end_time))
             rollout = dynamics.simulate(belief, self._path(step.trajectory, now, end), self.rng)

@@ -40,6 +40,15 @@ def progress_costs(mean, variance, way, aside, weight, variance_weight, cost):
 
 
 @njit(cache=True, nogil=True)
+def distance_costs(mean, variance, way, aside, weight, variance_weight, cost):
+    """Add weight * d_K, with d as in :func:`progress_costs`, to the costs of B candidates."""
+    last = mean.shape[1] - 1
+    for b in range(mean.shape[0]):
+        left = way_to_go(mean[b, last, 0], mean[b, last, 1], way, aside)
+        cost[b] += weight * math.sqrt(left * left + variance_weight * variance[b, last])
+
+
+@njit(cache=True, nogil=True)
 def separation_excess(rows, paths, gap, offset, crossing, excess):
     """How far end effectors come too near to each other, or arms cross, in B candidates [m].
 

@@ -90,13 +90,15 @@ class JointSpace:
     def factor(self, n_points: int, mean: NDArray, covariance: NDArray, present: NDArray) -> Factor:
         """The contact prior (6.41)-(6.43), and for every point that tools keep their height and stay upright.
 
-        Postures by inverse kinematics on the straight way to the contact are where it is linearised.
+        Postures by inverse kinematics on the straight way to the contact are where it is linearised. Of a
+        way that is partly out of reach, what is left is the part within.
 
         Raises:
-            InfeasibleError: the way to the contact is out of reach for an arm.
+            InfeasibleError: all of the way to the contact is out of reach for an arm.
         """
+        begin, mean = self._within_reach(present, mean)
         shares = np.arange(1, n_points + 1)[:, None] / n_points
-        postures = self.tools.joints(present + shares * (mean - present))
+        postures = self.tools.joints(begin + shares * (mean - begin))
         size = n_points * self.limits.dof
         precision, information = np.zeros((size, size)), np.zeros(size)
         for point, joints in enumerate(postures):
@@ -108,6 +110,16 @@ class JointSpace:
             for more_precision, more_information in factors:
                 precision, information = precision + more_precision, information + more_information
         return precision, information
+
+    def _within_reach(self, begin: NDArray, end: NDArray) -> tuple[NDArray, NDArray]:
+        """The first part of a straight way (m,) to (m,) that upright tools reach, all of it if none."""
+        way = begin + np.linspace(0.0, 1.0, 21)[:, None] * (end - begin)
+        inside = self.tools.contains(way)
+        if inside.all() or not inside.any():
+            return begin, end
+        first = int(np.argmax(inside))
+        outside = np.flatnonzero(~inside[first:])
+        return way[first], way[first + outside[0] - 1] if outside.size else end
 
     def _jacobians(self, joints: NDArray) -> tuple[NDArray, NDArray]:
         """Derivatives of the plane coordinates (m, n), and of heights and tilts of all tools (4 E, n)."""
