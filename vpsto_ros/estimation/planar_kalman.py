@@ -12,11 +12,10 @@ import math
 import numpy as np
 
 from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.estimation.measurement import Outcome, PoseMeasurement, checked, could_follow
 from vpsto_ros.estimation.motion_modes import ModeBelief, MotionModes
 from vpsto_ros.estimation.object_state import ObjectState, wrap_angle
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-
-_FARTHEST = 1e3  # no object on a table is farther away [m]
 
 
 @documented
@@ -84,29 +83,6 @@ class PlanarKalmanConfig:
             )
 
 
-class Outcome(str):
-    """What became of a measured pose, with the reason in words.
-
-    Compares as "accepted", "outlier", "stale", "reinitialized" or "invalid: <reason>".
-    """
-
-    kind: str
-    reason: str
-
-    def __new__(cls, kind: str, reason: str = "") -> "Outcome":
-        """Build from the kind ("invalid" without the colon) and the reason."""
-        outcome = super().__new__(cls, f"invalid: {reason}" if kind == "invalid" else kind)
-        outcome.kind, outcome.reason = kind, reason
-        return outcome
-
-
-@dataclasses.dataclass(frozen=True)
-class _Measurement:
-    stamp: float
-    pose: np.ndarray
-    covariance: np.ndarray
-
-
 class PlanarKalman:
     """Estimates an object's planar pose and twist from stamped poses.
 
@@ -124,7 +100,7 @@ class PlanarKalman:
         """Forget everything."""
         self._belief: ModeBelief | None = None
         self._stamp = -math.inf
-        self._pending: list[_Measurement] = []
+        self._pending: list[PoseMeasurement] = []
 
     @property
     def state(self) -> ObjectState | None:
@@ -164,7 +140,7 @@ class PlanarKalman:
             after a long gap); "stale" (not newer than what is known) or "invalid: reason". The attribute
             ``reason`` explains.
         """
-        defect, measurement = _checked(stamp, pose, covariance)
+        defect, measurement = checked(stamp, pose, covariance)
         if measurement is None:
             return Outcome("invalid", defect)
         if self._belief is None:
@@ -180,7 +156,7 @@ class PlanarKalman:
             return Outcome("reinitialized", f"first pose after {gap:.3g} s")
         return self._correct(self._belief, measurement, gap)
 
-    def _correct(self, belief: ModeBelief, measurement: _Measurement, gap: float) -> Outcome:
+    def _correct(self, belief: ModeBelief, measurement: PoseMeasurement, gap: float) -> Outcome:
         predicted = belief.mixed(self._modes, gap).propagated(self._modes, gap)
         innovation = predicted.innovation(measurement.pose, measurement.covariance)
         distance = float(innovation.distance.min())
@@ -192,7 +168,7 @@ class PlanarKalman:
         self._pending.clear()
         return Outcome("accepted")
 
-    def _pend(self, measurement: _Measurement, kind: str, reason: str) -> Outcome:
+    def _pend(self, measurement: PoseMeasurement, kind: str, reason: str) -> Outcome:
         """Keep what was refused; enough of it in agreement means that the filter is wrong, not the camera."""
         if self._pending and not self._agree(self._pending[-1], measurement):
             self._pending.clear()
@@ -203,17 +179,11 @@ class PlanarKalman:
         self._restart(self._pending)
         return Outcome("reinitialized", f"{count} consecutive outliers agree")
 
-    def _agree(self, first: _Measurement, second: _Measurement) -> bool:
-        gap = second.stamp - first.stamp
-        if not 0 < gap <= self.config.max_gap:
-            return False
-        step = second.pose - first.pose
-        noise = first.covariance + second.covariance
-        reach = self.config.max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
-        turn = self.config.max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
-        return math.hypot(step[0], step[1]) <= reach and abs(float(wrap_angle(step[2]))) <= turn
+    def _agree(self, first: PoseMeasurement, second: PoseMeasurement) -> bool:
+        config = self.config
+        return could_follow(first, second, config.max_speed, config.max_yaw_rate, config.max_gap)
 
-    def _restart(self, measurements: list[_Measurement]) -> None:
+    def _restart(self, measurements: list[PoseMeasurement]) -> None:
         """Begin at the first measurement and replay the others, so that the twist is known as well."""
         first = measurements[0]
         count = len(self._modes.dwell)
@@ -250,26 +220,3 @@ def _object_state(stamp: float, belief: ModeBelief) -> ObjectState:
     mean, covariance = belief.moments()
     mean[2] = wrap_angle(mean[2])
     return ObjectState(stamp, mean[:3], mean[3:], covariance)
-
-
-def _checked(stamp: float, pose: np.ndarray, covariance: np.ndarray) -> tuple[str, _Measurement | None]:
-    """The measurement as float64 arrays of its own, or what is wrong with it."""
-    try:
-        time, where = float(stamp), np.array(pose, dtype=float)
-        noise = np.array(covariance, dtype=float)
-    except (TypeError, ValueError) as error:
-        return f"not numbers: {error}", None
-    if where.shape != (3,) or noise.shape != (3, 3):
-        return f"expected pose (3,) and covariance (3, 3), got {where.shape} and {noise.shape}", None
-    if not (math.isfinite(time) and np.isfinite(where).all() and np.isfinite(noise).all()):
-        return "stamp, pose or covariance is not finite", None
-    if np.abs(where[:2]).max() > _FARTHEST:
-        return f"position {where[:2]} is beyond {_FARTHEST:g} m", None
-    where[2] = wrap_angle(where[2])
-    if np.abs(noise - noise.T).max() > 1e-6 * np.abs(noise).max():
-        return "covariance is not symmetric", None
-    try:
-        np.linalg.cholesky(noise)
-    except np.linalg.LinAlgError:
-        return "covariance is not positive definite", None
-    return "", _Measurement(time, where, 0.5 * (noise + noise.T))

@@ -1,0 +1,77 @@
+"""Measured poses of an object on the table, and what becomes of them in a filter."""
+
+import dataclasses
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vpsto_ros.estimation.object_state import wrap_angle
+
+_FARTHEST = 1e3  # no object on a table is farther away [m]
+
+
+class Outcome(str):
+    """What became of a measurement, with the reason in words.
+
+    Compares as "accepted", "outlier", "stale", "reinitialized" or "invalid: <reason>".
+    """
+
+    kind: str
+    reason: str
+
+    def __new__(cls, kind: str, reason: str = "") -> "Outcome":
+        """Build from the kind ("invalid" without the colon) and the reason."""
+        outcome = super().__new__(cls, f"invalid: {reason}" if kind == "invalid" else kind)
+        outcome.kind, outcome.reason = kind, reason
+        return outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseMeasurement:
+    """A stamped pose (x, y, yaw) with its covariance (3, 3)."""
+
+    stamp: float
+    pose: np.ndarray
+    covariance: np.ndarray
+
+
+def checked(stamp: float, pose: ArrayLike, covariance: ArrayLike) -> tuple[str, PoseMeasurement | None]:
+    """The measurement as float64 arrays of its own, or what is wrong with it."""
+    try:
+        time, where = float(stamp), np.array(pose, dtype=float)
+        noise = np.array(covariance, dtype=float)
+    except (TypeError, ValueError) as error:
+        return f"not numbers: {error}", None
+    if where.shape != (3,) or noise.shape != (3, 3):
+        return f"expected pose (3,) and covariance (3, 3), got {where.shape} and {noise.shape}", None
+    if not (math.isfinite(time) and np.isfinite(where).all() and np.isfinite(noise).all()):
+        return "stamp, pose or covariance is not finite", None
+    if np.abs(where[:2]).max() > _FARTHEST:
+        return f"position {where[:2]} is beyond {_FARTHEST:g} m", None
+    where[2] = wrap_angle(where[2])
+    if np.abs(noise - noise.T).max() > 1e-6 * np.abs(noise).max():
+        return "covariance is not symmetric", None
+    try:
+        np.linalg.cholesky(noise)
+    except np.linalg.LinAlgError:
+        return "covariance is not positive definite", None
+    return "", PoseMeasurement(time, where, 0.5 * (noise + noise.T))
+
+
+def could_follow(
+    first: PoseMeasurement,
+    second: PoseMeasurement,
+    max_speed: float,
+    max_yaw_rate: float = math.inf,
+    max_gap: float = math.inf,
+) -> bool:
+    """Whether an object that moves no faster [m/s, rad/s] can have been at both, no more than max_gap apart."""
+    gap = second.stamp - first.stamp
+    if not 0 < gap <= max_gap:
+        return False
+    step = second.pose - first.pose
+    noise = first.covariance + second.covariance
+    reach = max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
+    turn = max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
+    return math.hypot(step[0], step[1]) <= reach and abs(float(wrap_angle(step[2]))) <= turn
