@@ -210,7 +210,9 @@ class Trajectory:
         if not start < end:
             raise InvalidInputError(f"clipping needs start < end, got {start} and {end}")
         times, pieces = [float(start)], []
-        inner = self.times[(self.times > start) & (self.times < end)]
+        # A knot at the very start or end, but for round-off, would leave a sliver of 1e-16 s.
+        sliver = min(_JOIN_TOLERANCE, 0.25 * (end - start))
+        inner = self.times[(self.times > start + sliver) & (self.times < end - sliver)]
         for stop in (*inner, end):
             begin = times[-1]
             times.append(float(stop))
@@ -218,12 +220,13 @@ class Trajectory:
         return Trajectory(np.array(times), np.array(pieces))
 
     def _piece(self, begin: float, stop: float) -> NDArray[np.float64]:
-        """Coefficients (6, n) from begin to stop, which no knot separates."""
-        if stop <= self.times[0] or begin >= self.times[-1]:
+        """Coefficients (6, n) from begin to stop, which no knot separates but for round-off."""
+        middle = 0.5 * (begin + stop)
+        if middle <= self.times[0] or middle >= self.times[-1]:
             piece = np.zeros((SIZE, self.dof))
             piece[0] = self(begin)
             return piece
-        segment = int(np.searchsorted(self.times, begin, side="right")) - 1
+        segment = int(np.searchsorted(self.times, middle, side="right")) - 1
         return shifted_origin(self.coefficients[segment], begin - self.times[segment])
 
     def followed_by(self, other: "Trajectory") -> "Trajectory":
