@@ -58,7 +58,7 @@ def predict_discs(rows, radius, k, friction, start, paths, mean, variance, conta
         radius: of the object [m].
         k: 1 / c^2 of the limit surface [1/m^2].
         friction: whether particles carry friction.
-        start: state of the particles, shape (STATE_ROWS, P).
+        start: table of the particles, of which the first STATE_ROWS rows are read, shape (TABLE_ROWS, P).
         paths: plane coordinates from the present ones on, shape (B, K + 1, m).
         mean: output, mean positions, shape (B, K + 1, 2).
         variance: output, (6.23), shape (B, K + 1).
@@ -134,7 +134,7 @@ def simulate_discs(rows, radius, k, friction, table, path, step_variance, way_va
         if find_near(table, count, effectors) > 0:
             worst = min(worst, give_way(table, count, effectors, radius, k, friction))
             _perturb(table, count, effectors, step_variance, way_variance, rng)
-            give_way(table, count, effectors, radius, k, False)
+            worst = min(worst, give_way(table, count, effectors, radius, k, False))
             for e in range(total):
                 effectors[e, CLEAR] = 0.0
         if j % stride == 0 and j // stride < poses.shape[0]:

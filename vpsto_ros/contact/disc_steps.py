@@ -31,10 +31,10 @@ X, Y, BX, BY, YAW, MU, X0, Y0, TOUCHED, FARTHEST = range(10)
 STATE_ROWS, TABLE_ROWS = 6, 10
 
 # Columns of the table of end effectors: centre, cosine and sine, motion and turn of this step, half sizes,
-# radius grown by the object's; reach of its turn, bound on its clearance, whether it is in contact; a
-# linearised constraint (normal, bound).
-EX, EY, EC, ES, MX, MY, TURN, HX, HY, GROWN, REACH, CLEAR, NEAR, CNX, CNY, BOUND = range(16)
-EFFECTOR_COLUMNS = 16
+# radius grown by the object's; reach of its turn, bound on its clearance; a linearised constraint (normal,
+# bound).
+EX, EY, EC, ES, MX, MY, TURN, HX, HY, GROWN, REACH, CLEAR, CNX, CNY, BOUND = range(15)
+EFFECTOR_COLUMNS = 15
 
 CONTACT_TOLERANCE = 1e-9
 """A penetration [m] smaller than this is round-off, not a contact: a tool at rest does not push."""
@@ -56,6 +56,15 @@ def place(rows, grown_by, points, k, effectors):
             effectors[e, TURN] = points[k, c + 2] - points[before, c + 2]
         effectors[e, HX], effectors[e, HY] = rows[e, 0], rows[e, 1]
         effectors[e, GROWN], effectors[e, REACH] = rows[e, 2] + grown_by, rows[e, 3]
+
+
+@njit(**VECTORISED, inline="always")
+def _polar(dx, dy):
+    """Length of a vector and its direction, which is along x where there is none."""
+    square = dx * dx + dy * dy
+    some = square > 1e-24
+    length = math.sqrt(square if some else 1.0)
+    return length if some else 0.0, dx / length if some else 1.0, dy / length if some else 0.0
 
 
 @njit(**VECTORISED, inline="always")
@@ -92,13 +101,12 @@ def smallest_gap(table, count, effectors, e):
 
 @njit(**VECTORISED)
 def find_near(table, count, effectors):
-    """Mark the end effectors that penetrate some particle; returns how many do.
+    """Number of end effectors that penetrate some particle.
 
     As long as the bound on its clearance is positive an end effector cannot have reached any particle.
     """
     found = 0
     for e in range(effectors.shape[0]):
-        effectors[e, NEAR] = 0.0
         clear = effectors[e, CLEAR]
         if clear > 0.0:
             mx, my = effectors[e, MX], effectors[e, MY]
@@ -106,7 +114,6 @@ def find_near(table, count, effectors):
         if clear <= 0.0:
             clear = smallest_gap(table, count, effectors, e)
             if clear < -CONTACT_TOLERANCE:
-                effectors[e, NEAR] = 1.0
                 found += 1
         effectors[e, CLEAR] = clear
     return found
@@ -151,9 +158,7 @@ def _dragged(x, y, bx, by, mu, ex, ey, grown, mx, my, radius, k):
     Returns:
         position, offset of the centre of friction, turn, penetration at the beginning.
     """
-    dx, dy = x - ex, y - ey
-    distance = math.sqrt(dx * dx + dy * dy) + 1e-12
-    nx, ny = dx / distance, dy / distance
+    distance, nx, ny = _polar(x - ex, y - ey)
     depth = grown - distance
     touching = depth > CONTACT_TOLERANCE
     used = depth if touching else 0.0
@@ -162,12 +167,12 @@ def _dragged(x, y, bx, by, mu, ex, ey, grown, mx, my, radius, k):
     slip = (nx * my - ny * mx) * (used / approach if approach > used else 1.0)
     slip = slip if touching else 0.0
     along, across, turn = _impulse(used, slip, nx * bx + ny * by, nx * by - ny * bx, radius, k, mu)
-    dx, dy = dx + nx * along - ny * across, dy + ny * along + nx * across
+    x, y = x + nx * along - ny * across, y + ny * along + nx * across
     # What curvature leaves of the penetration is projected out.
-    distance = math.sqrt(dx * dx + dy * dy) + 1e-12
-    push = grown / distance if touching & (distance < grown) else 1.0
+    distance, nx, ny = _polar(x - ex, y - ey)
+    left = touching & (distance < grown)
     bx, by = _turned(bx, by, turn)
-    return ex + push * dx, ey + push * dy, bx, by, turn, depth
+    return ex + grown * nx if left else x, ey + grown * ny if left else y, bx, by, turn, depth
 
 
 @njit(**VECTORISED)
@@ -281,14 +286,13 @@ def _dragged_by(table, i, effectors, e, radius, k):
 def project_one_disc(table, count, effectors):
     """Nearest points outside one grown disc; see :func:`project_two_discs`."""
     ex, ey, grown = effectors[0, EX], effectors[0, EY], effectors[0, GROWN]
-    limit = (grown - CONTACT_TOLERANCE) ** 2
     for i in range(count):
-        dx, dy = table[X, i] - ex, table[Y, i] - ey
-        square = dx * dx + dy * dy
-        push = grown / (math.sqrt(square) + 1e-12)
-        push = push if square < grown * grown else 1.0
-        table[X, i], table[Y, i] = ex + push * dx, ey + push * dy
-        table[TOUCHED, i] = 1.0 if square < limit else 0.0
+        x, y = table[X, i], table[Y, i]
+        distance, nx, ny = _polar(x - ex, y - ey)
+        inside = distance < grown - CONTACT_TOLERANCE
+        table[X, i] = ex + grown * nx if inside else x
+        table[Y, i] = ey + grown * ny if inside else y
+        table[TOUCHED, i] = 1.0 if inside else 0.0
     return 1.0
 
 
@@ -321,15 +325,14 @@ def project_two_discs(table, count, effectors):
     both = 0.0
     for i in range(count):
         x, y = table[X, i], table[Y, i]
-        dx1, dy1, dx2, dy2 = x - x1, y - y1, x - x2, y - y2
-        d1 = math.sqrt(dx1 * dx1 + dy1 * dy1) + 1e-12
-        d2 = math.sqrt(dx2 * dx2 + dy2 * dy2) + 1e-12
+        d1, nx1, ny1 = _polar(x - x1, y - y1)
+        d2, nx2, ny2 = _polar(x - x2, y - y2)
         inside1, inside2 = d1 < r1 - CONTACT_TOLERANCE, d2 < r2 - CONTACT_TOLERANCE
-        px1, py1 = x1 + dx1 * (r1 / d1), y1 + dy1 * (r1 / d1)
-        px2, py2 = x2 + dx2 * (r2 / d2), y2 + dy2 * (r2 / d2)
+        px1, py1 = x1 + r1 * nx1, y1 + r1 * ny1
+        px2, py2 = x2 + r2 * nx2, y2 + r2 * ny2
         free1 = (px1 - x2) * (px1 - x2) + (py1 - y2) * (py1 - y2) >= r2 * r2
         free2 = (px2 - x1) * (px2 - x1) + (py2 - y1) * (py2 - y1) >= r1 * r1
-        side = h if ux * dy1 - uy * dx1 >= 0.0 else -h
+        side = h if ux * (y - y1) - uy * (x - x1) >= 0.0 else -h
         first = inside1 & free1 & ((not (inside2 & free2)) | (r1 - d1 <= r2 - d2))
         second = inside2 & free2 & (not first)
         outside = not (inside1 | inside2)
@@ -357,7 +360,7 @@ def _project(table, i, effectors):
 
     Sequential linearisation: distances to convex sets are convex, so that a step which satisfies all
     linearised constraints satisfies the true ones, and repeating it only brings the point nearer to where it
-    began. A particle that no displacement frees stays, and the product is -1.
+    began. A particle stays, and the product is -1, where the linearised constraints contradict each other.
     """
     x0, y0 = table[X, i], table[Y, i]
     x, y, worst = x0, y0, 1.0
@@ -367,9 +370,10 @@ def _project(table, i, effectors):
             break
         table[TOUCHED, i] = 1.0
         found, dx, dy, product = _shortest(effectors)
-        worst = min(worst, product)
         if not found:
+            worst = -1.0 if iteration == 0 else worst  # later on it is round-off: this place is free
             break
+        worst = product
         moved = abs(x0 + dx - x) + abs(y0 + dy - y)
         x, y = x0 + dx, y0 + dy
         if moved < CONTACT_TOLERANCE:
