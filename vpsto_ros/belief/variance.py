@@ -47,7 +47,7 @@ def require_perturbation(perturbation: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def robustness_costs(variance, contact, perturbation, cost, worst):
+def robustness_costs(variance, contact, perturbation, cost, worst, largest=1.0):
     """Eq. (6.32) with (6.33), and the largest gain, of B candidates.
 
     Deviation: the exponents are divided by the number of steps K instead of K - 1, which is 0 for K = 1.
@@ -58,6 +58,7 @@ def robustness_costs(variance, contact, perturbation, cost, worst):
         perturbation: V_w.
         cost: output, shape (B,).
         worst: output, largest gain, shape (B,).
+        largest: gain that a plan may have, 1 in eq. (6.33).
     """
     steps = contact.shape[1]
     for b in range(contact.shape[0]):
@@ -66,5 +67,5 @@ def robustness_costs(variance, contact, perturbation, cost, worst):
             gain = (variance[b, k + 1] + contact[b, k] * perturbation) / (variance[b, k] + perturbation)
             total += 1.0 - gain
             most = max(most, gain)
-        weight = 1.0 if most <= 1.0 + GAIN_TOLERANCE else VIOLATION_WEIGHT
+        weight = 1.0 if most <= largest + GAIN_TOLERANCE else VIOLATION_WEIGHT
         cost[b], worst[b] = weight * np.exp(-total / steps), most

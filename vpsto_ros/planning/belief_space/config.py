@@ -22,6 +22,13 @@ class RobustPushingConfig:
     perturbation: float = option(
         1e-6, "variance of the perturbation in a step V_w", unit="m^2", minimum=1e-12, maximum=1e-2
     )
+    largest_gain: float = option(
+        1.0,
+        "largest variance gain of a valid plan (6.31); particles with friction spread in any push with one "
+        "side, which needs more than 1",
+        minimum=1.0,
+        maximum=10.0,
+    )
     progress_weight: float = option(
         30.0, "lambda of the progress cost (6.54)", unit="1/m", minimum=0.1, maximum=1e4
     )

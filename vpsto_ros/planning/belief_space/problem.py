@@ -113,9 +113,11 @@ class RobustPushingProblem:
         valid = (outcome.excess <= 0.0) & (prediction.step <= config.longest_step)
         if config.robust:
             robustness_costs(
-                prediction.variance, prediction.contact, config.perturbation, robust, outcome.gain
-            )
-            valid &= (outcome.gain <= 1.0 + GAIN_TOLERANCE) & (prediction.wedge >= config.wedge)
+                prediction.variance, prediction.contact, config.perturbation, robust, outcome.gain,
+                config.largest_gain,
+            )  # fmt: skip
+            valid &= outcome.gain <= config.largest_gain + GAIN_TOLERANCE
+            valid &= prediction.wedge >= config.wedge
         penalty = np.where(valid, 0.0, INVALID_COST * (1.0 + outcome.excess))
         return Evaluation(cost + robust + penalty, valid)
 
