@@ -123,7 +123,7 @@ class BeliefDynamics:
             friction, center = self._contact_parameters(belief)
             multi_tool.predict_shapes(
                 self.shape.kernel_rows, self.shape.outline_segments, self.effectors.rows, self._k, friction,
-                belief.poses, center, paths, *outputs,
+                belief.continuous_poses, center, paths, *outputs,
             )  # fmt: skip
         return BeliefPrediction(*outputs)
 
@@ -139,9 +139,11 @@ class BeliefDynamics:
             stride: every how many steps poses are noted.
 
         Raises:
-            InvalidInputError: a wrong shape, or a path that is not finite.
+            InvalidInputError: a wrong shape, a path that is not finite, or a stride below 1.
         """
         path = self._paths(path, 2)
+        if stride < 1:
+            raise InvalidInputError(f"stride must be at least 1, got {stride}")
         noted = np.empty(((len(path) - 1) // stride + 1, belief.count, 3))
         noise = (self.step_variance, self.way_variance, rng, stride, noted)
         if self.radius is not None:

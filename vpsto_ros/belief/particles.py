@@ -100,6 +100,13 @@ class ObjectBelief:
         return np.array([*self.poses[:, :2].mean(axis=0), yaw])
 
     @cached_property
+    def continuous_poses(self) -> NDArray[np.float64]:
+        """The poses with yaws within half a turn of the mean, so that they can be averaged, (P, 3)."""
+        poses, mean = self.poses.copy(), self.mean[2]
+        poses[:, 2] = mean + np.remainder(poses[:, 2] - mean + np.pi, 2.0 * np.pi) - np.pi
+        return poses
+
+    @cached_property
     def covariance(self) -> NDArray[np.float64]:
         """Covariance of the position (2, 2) [m^2]."""
         offset = self.poses[:, :2] - self.mean[:2]

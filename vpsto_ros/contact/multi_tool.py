@@ -11,12 +11,15 @@ import numpy as np
 from numba import njit
 
 from vpsto_ros.contact.narrow_phase import COMPILED, GAP, NX, NY, PX, PY, tool_contacts
-from vpsto_ros.contact.projection import CONTACT_COLUMNS, SLIP, solve_contacts
-from vpsto_ros.contact.rollout_kernel import PENETRATION_TOLERANCE, _move
+from vpsto_ros.contact.projection import CONTACT_COLUMNS, LAMBDA_N, SLIP, solve_contacts
+from vpsto_ros.contact.rollout_kernel import PENETRATION_TOLERANCE, _move, _part_in_contact, _tool_motion
 
 SUBSTEP = 0.002
 """Longest motion of an end effector between two projections [m]."""
 MARGIN = 0.004
+"""Contacts that a substep may close are solved for from this gap on [m]."""
+PRESSING = 1e-8
+"""An impulse [m] smaller than this is what the solver leaves, not a contact that holds the object."""
 _ITERATIONS = 20
 TOOL = 10
 """Column of a contact that says whose it is."""
@@ -62,27 +65,23 @@ def _set_slips(contacts, count, rows, point, before, share, previous, pose):
         e = int(contacts[j, TOOL])
         tx, ty, tc, ts = _tool_pose(rows, point, before, share, e)
         bx, by, bc, bs = _tool_pose(rows, point, before, previous, e)
-        px, py = contacts[j, PX], contacts[j, PY]
-        ax, ay = ox + c * px - s * py - tx, oy + s * px + c * py - ty
-        rc, rs = tc * bc + ts * bs, bs * tc - bc * ts  # the turn that leads the tool back
-        wx, wy = tx + ax - bx - rc * ax + rs * ay, ty + ay - by - rs * ax - rc * ay
-        mx, my = c * wx + s * wy, c * wy - s * wx
-        nx, ny, depth = contacts[j, NX], contacts[j, NY], -contacts[j, GAP]
-        approach = -nx * mx - ny * my
-        part = depth / approach if 0.0 < depth < approach else 1.0
-        contacts[j, SLIP] = part * (nx * my - ny * mx)
+        mx, my = _tool_motion(
+            contacts[j, PX], contacts[j, PY], ox, oy, c, s, bx, by, bc, bs, tx, ty, tc, ts
+        )  # fmt: skip
+        nx, ny = contacts[j, NX], contacts[j, NY]
+        contacts[j, SLIP] = _part_in_contact(contacts[j, GAP], nx, ny, mx, my) * (nx * my - ny * mx)
 
 
 @njit(**COMPILED)
 def _wedge(contacts, count):
-    """Smallest product of normals of two end effectors that both penetrate."""
+    """Smallest product of the normals of two end effectors that both press, after `solve_contacts`."""
     worst = 1.0
     for i in range(count):
         for j in range(i):
-            if contacts[i, TOOL] != contacts[j, TOOL]:
-                if contacts[i, GAP] < PENETRATION_TOLERANCE and contacts[j, GAP] < PENETRATION_TOLERANCE:
-                    product = contacts[i, NX] * contacts[j, NX] + contacts[i, NY] * contacts[j, NY]
-                    worst = min(worst, product)
+            pressing = contacts[i, LAMBDA_N] > PRESSING and contacts[j, LAMBDA_N] > PRESSING
+            if pressing and contacts[i, TOOL] != contacts[j, TOOL]:
+                product = contacts[i, NX] * contacts[j, NX] + contacts[i, NY] * contacts[j, NY]
+                worst = min(worst, product)
     return worst
 
 
@@ -91,8 +90,8 @@ def advance(primitives, outline, rows, point, before, pose, k, mu, fx, fy, conta
     """Move the end effectors from one plane point to the next; `pose` (x, y, cos, sin, yaw) gives way.
 
     Returns:
-        whether there was contact, smallest product of two normals (-1: no way out was found), last normal
-        in the object frame, whether only one end effector touched last.
+        whether there was contact, smallest product of two normals (-1: no way out was found), and of the last
+        substep with contact: normal of a contact in the object frame, whether only one end effector pressed.
     """
     longest = 0.0
     for e in range(rows.shape[0]):
@@ -104,26 +103,29 @@ def advance(primitives, outline, rows, point, before, pose, k, mu, fx, fy, conta
     # Nothing is in reach: no substeps.
     if gather(primitives, outline, rows, point, before, 1.0, pose, 0.0, contacts)[1] > longest:
         return False, 1.0, 0.0, 0.0, False
-    substeps = max(1, int(math.ceil(longest / SUBSTEP)))
+    substeps = max(1, math.ceil(longest / SUBSTEP))
     touched, worst, nx, ny, single = False, 1.0, 0.0, 0.0, False
     for i in range(1, substeps + 1):
-        share = i / substeps
+        share, presses = i / substeps, -1
         for iteration in range(_ITERATIONS + 1):
             count, gap = gather(primitives, outline, rows, point, before, share, pose, MARGIN, contacts)
-            if gap >= -PENETRATION_TOLERANCE or count == 0:
-                break
-            if iteration == _ITERATIONS:
-                worst = -1.0
+            if gap >= -PENETRATION_TOLERANCE:
                 break
             touched = True
+            if iteration == _ITERATIONS or count == 0:
+                worst = -1.0
+                break
             friction = mu if iteration == 0 else 0.0
             if friction > 0.0:
                 _set_slips(contacts, count, rows, point, before, share, (i - 1) / substeps, pose)
-            worst = min(worst, _wedge(contacts, count))
-            nx, ny, single = contacts[0, NX], contacts[0, NY], True
-            for j in range(1, count):
-                single = single and contacts[j, TOOL] == contacts[0, TOOL]
             vx, vy, w = solve_contacts(contacts, count, k, friction, fx, fy)
+            worst = min(worst, _wedge(contacts, count))
+            for j in range(count):
+                if contacts[j, LAMBDA_N] > PRESSING:
+                    if presses < 0:
+                        presses = int(contacts[j, TOOL])
+                        nx, ny, single = contacts[j, NX], contacts[j, NY], True
+                    single = single and contacts[j, TOOL] == presses
             pose[0], pose[1], pose[2], pose[3] = _move(pose[0], pose[1], pose[2], pose[3], vx, vy, w, fx, fy)
             pose[4] += w
     return touched, worst, nx, ny, single
@@ -266,10 +268,11 @@ def simulate_shapes(
                 pose[0] += w * tx
                 pose[1] += w * ty
                 # The end effectors stand: what the perturbation made penetrate is projected out.
-                advance(
+                _, product, _, _, _ = advance(
                     primitives, outline, rows, path[j], path[j], pose, k, 0.0, centers[i, 0], centers[i, 1],
                     contacts,
                 )  # fmt: skip
+                worst = min(worst, product)
             poses[i, 0], poses[i, 1], poses[i, 2] = pose[0], pose[1], pose[4]
         if j % stride == 0 and j // stride < noted.shape[0]:
             noted[j // stride] = poses
