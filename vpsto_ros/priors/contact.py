@@ -40,7 +40,7 @@ def contact_factor(
         )
     block = _precision(covariance, dof)
     if not np.isfinite(target).all():
-        raise InvalidInputError("mean and covariance must be finite and the covariance symmetric")
+        raise InvalidInputError("the mean of a contact must be finite")
     return _embedded(n_points, dof, point_index, block, block @ target)
 
 
@@ -72,17 +72,18 @@ def joint_contact_factor(
         InvalidInputError: as :func:`contact_factor`.
     """
     joints, jacobian = np.asarray(joints, dtype=float), np.asarray(jacobian, dtype=float)
-    size = np.size(mean)
-    if jacobian.shape != (size, joints.size) or np.shape(reached) != (size,):
+    target, reached = np.asarray(mean, dtype=float), np.asarray(reached, dtype=float)
+    size = target.size
+    if jacobian.shape != (size, joints.size) or not target.shape == reached.shape == (size,):
         raise InvalidInputError(
-            f"expected a Jacobian ({size}, {joints.size}) and coordinates ({size},), got {jacobian.shape} "
-            f"and {np.shape(reached)}"
+            f"expected a Jacobian ({size}, {joints.size}) and coordinates ({size},), got {jacobian.shape}, "
+            f"{target.shape} and {reached.shape}"
         )
-    if not (np.isfinite(joints).all() and np.isfinite(jacobian).all()):
-        raise InvalidInputError("joints and Jacobian of a contact must be finite")
+    if not all(np.isfinite(array).all() for array in (joints, jacobian, target, reached)):
+        raise InvalidInputError("joints, Jacobian and coordinates of a contact must be finite")
     precision = _precision(covariance, size)
     block = jacobian.T @ precision @ jacobian
-    information = block @ joints + jacobian.T @ precision @ (np.asarray(mean) - reached)
+    information = block @ joints + jacobian.T @ precision @ (target - reached)
     return _embedded(n_points, joints.size, point_index, block, information)
 
 
@@ -99,17 +100,29 @@ def contact_distribution(
 
     Returns:
         mean (m,) and covariance Sigma^{r|o} + A Sigma^o A^T (m, m).
+
+    Raises:
+        InvalidInputError: the shapes do not fit.
     """
     mean, a = np.asarray(contact, dtype=float), np.asarray(jacobian, dtype=float)
-    return mean, np.asarray(contact_covariance) + a @ np.asarray(object_covariance) @ a.T
+    given, spread = np.asarray(contact_covariance, dtype=float), np.asarray(object_covariance, dtype=float)
+    shapes = (a.shape, given.shape, spread.shape)
+    if mean.ndim != 1 or a.ndim != 2 or shapes != (
+        (mean.size, a.shape[1]), (mean.size, mean.size), (a.shape[1], a.shape[1]),
+    ):  # fmt: skip
+        raise InvalidInputError(
+            f"expected a contact (m,), a Jacobian (m, o) and covariances (o, o) and (m, m), got "
+            f"{mean.shape}, {a.shape}, {spread.shape} and {given.shape}"
+        )
+    return mean, given + a @ spread @ a.T
 
 
 def _precision(covariance: np.ndarray, size: int) -> np.ndarray:
     spread = np.asarray(covariance, dtype=float)
     if spread.shape != (size, size):
         raise InvalidInputError(f"expected a covariance ({size}, {size}), got {spread.shape}")
-    if not (np.isfinite(spread).all() and np.allclose(spread, spread.T)):
-        raise InvalidInputError("mean and covariance must be finite and the covariance symmetric")
+    if not np.isfinite(spread).all() or np.abs(spread - spread.T).max() > 1e-6 * np.abs(spread).max():
+        raise InvalidInputError("the covariance of a contact must be finite and symmetric")
     try:
         np.linalg.cholesky(spread)
     except np.linalg.LinAlgError as error:
