@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.estimation.object_state import wrap_angle
 
@@ -66,7 +66,7 @@ def could_follow(
     max_yaw_rate: float = math.inf,
     max_gap: float = math.inf,
 ) -> bool:
-    """Whether an object that moves no faster [m/s, rad/s] can have been at both, no more than max_gap apart."""
+    """Whether an object no faster than these [m/s, rad/s] can have been at both, within max_gap [s]."""
     gap = second.stamp - first.stamp
     if not 0 < gap <= max_gap:
         return False
@@ -75,3 +75,14 @@ def could_follow(
     reach = max_speed * gap + 4.0 * math.sqrt(noise[0, 0] + noise[1, 1])
     turn = max_yaw_rate * gap + 4.0 * math.sqrt(noise[2, 2])
     return math.hypot(step[0], step[1]) <= reach and abs(float(wrap_angle(step[2]))) <= turn
+
+
+def finite_array(values: object, *shapes: tuple[int, ...]) -> tuple[NDArray[np.float64], str]:
+    """Values as an array of one of these shapes, and what is wrong with them."""
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        return np.empty(0), f"not numbers: {error}"
+    if array.shape not in shapes:
+        return array, f"expected shape {' or '.join(map(str, shapes))}, got {array.shape}"
+    return array, "" if np.isfinite(array).all() else "not finite"
