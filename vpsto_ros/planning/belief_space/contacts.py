@@ -66,16 +66,13 @@ class ContactRule:
         discs = [isinstance(shape, Disc) for shape in self.effectors.shapes]
         if not all(discs):
             return self._rectangles(pose, along, present)
-        slots = np.array([self._slot(pose, along, a, e) for e, a in enumerate(self._angles())])
-        here = present.reshape(-1, 2)
-        orders = list(itertools.permutations(range(len(slots))))
-        ways = [np.linalg.norm(slots[list(order)] - here, axis=1).sum() for order in orders]
-        if self.crossing is not None:
-            ways = [
-                way + (0.0 if self.crossing.allows(slots[order[0]], slots[order[1]]) else 10.0)
-                for way, order in zip(ways, orders, strict=True)
-            ]
-        return slots[list(orders[int(np.argmin(ways))])].ravel()
+        effectors, angles = range(self.effectors.count), self._angles()
+        # Places by slot and end effector: (slots, E, 2).
+        places = np.array([[self._slot(pose, along, a, e) for e in effectors] for a in angles])
+        orders = [list(order) for order in itertools.permutations(effectors)]
+        candidates = [places[order, effectors] for order in orders]
+        ways = [self._way(candidate, present.reshape(-1, 2)) for candidate in candidates]
+        return candidates[int(np.argmin(ways))].ravel()
 
     def jacobian(self) -> NDArray[np.float64]:
         """A of eq. (6.38): all end effectors move along with the object, shape (m, 2)."""
@@ -83,6 +80,12 @@ class ContactRule:
         for column in self.effectors.columns:
             a[column, 0] = a[column + 1, 1] = 1.0
         return a
+
+    def _way(self, places: NDArray, present: NDArray) -> float:
+        """Way of all end effectors to their places (E, 2) [m], much longer where arms would cross there."""
+        way = float(np.linalg.norm(places - present, axis=1).sum())
+        crossed = self.crossing is not None and len(places) > 1 and not self.crossing.allows(*places[:2])
+        return way + 10.0 if crossed else way
 
     def _angles(self) -> NDArray:
         count = self.effectors.count
@@ -111,6 +114,7 @@ class ContactRule:
 
     def _extent(self, pose: NDArray, outward: NDArray) -> float:
         """How far the object reaches from its origin along a direction: its support function [m]."""
-        if len(self.shape.primitives) == 1 and isinstance(self.shape.primitives[0], Disc):
-            return self.shape.primitives[0].radius
+        first, *rest = self.shape.primitives
+        if isinstance(first, Disc) and not rest and first.center == (0.0, 0.0):
+            return first.radius
         return max(float(((corners - pose[:2]) @ outward).max()) for corners in self.shape.transform(pose))

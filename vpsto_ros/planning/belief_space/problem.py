@@ -36,7 +36,7 @@ class HorizonOutcome:
         motion: their motions in the search space.
         paths: plane coordinates, shape (B, K + 1, m).
         prediction: of the belief.
-        gain: largest variance gain, shape (B,).
+        gain: largest variance gain, shape (B,); NaN where nobody has looked at it.
         excess: largest violation of a constraint on the robot [m], shape (B,).
     """
 
@@ -118,8 +118,12 @@ class RobustPushingProblem:
             )  # fmt: skip
             valid &= outcome.gain <= config.largest_gain + GAIN_TOLERANCE
             valid &= prediction.wedge >= config.wedge
-        penalty = np.where(valid, 0.0, INVALID_COST * (1.0 + outcome.excess))
-        return Evaluation(cost + robust + penalty, valid)
+        cost += robust
+        worst_valid = cost[valid].max(
+            initial=0.0
+        )  # those that move the object away cost more than any offset
+        penalty = np.where(valid, 0.0, INVALID_COST * (1.0 + outcome.excess) + worst_valid)
+        return Evaluation(cost + penalty, valid)
 
     def outcome(self, points: NDArray) -> HorizonOutcome:
         """Synthesise candidates (B, N, n) and propagate the belief along them."""
@@ -135,7 +139,7 @@ class RobustPushingProblem:
             self.dynamics.effectors.rows, paths, config.separation, *self._arms, excess,
         )  # fmt: skip
         self._add_robot_limits(motion, paths, heights, excess)
-        return HorizonOutcome(motion, paths, prediction, np.empty(len(points)), excess)
+        return HorizonOutcome(motion, paths, prediction, np.full(len(points), np.nan), excess)
 
     def _add_robot_limits(
         self, motion: TrajectoryBatch, paths: NDArray, heights: NDArray | None, excess: NDArray

@@ -26,8 +26,8 @@ from vpsto_ros.trajectory import Trajectory, braking_trajectory
 
 MAX_HORIZONS = 500
 """Horizons after which the thesis gives up (6.6.3)."""
-STILL = 1e-3
-"""Speed below which there is nothing to brake, in units of the search space per second."""
+STILL = 1e-9
+"""Speed below which there is nothing to brake, in units of the search space per second: round-off."""
 
 
 @dataclasses.dataclass(frozen=True)

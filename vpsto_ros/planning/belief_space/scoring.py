@@ -5,6 +5,9 @@ import math
 import numpy as np
 from numba import njit
 
+LARGEST_EXPONENT = 100.0
+"""Of the progress cost: plans that move the object far away cost much, but not infinitely much."""
+
 
 @njit(cache=True, nogil=True)
 def way_to_go(x, y, way, aside):
@@ -36,7 +39,7 @@ def progress_costs(mean, variance, way, aside, weight, variance_weight, cost):
         after = way_to_go(mean[b, last, 0], mean[b, last, 1], way, aside)
         d0 = math.sqrt(before * before + variance_weight * variance[b, 0])
         dk = math.sqrt(after * after + variance_weight * variance[b, last])
-        cost[b] = math.exp(-weight * (d0 - dk))
+        cost[b] = math.exp(min(-weight * (d0 - dk), LARGEST_EXPONENT))
 
 
 @njit(cache=True, nogil=True)
