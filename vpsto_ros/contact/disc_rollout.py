@@ -27,6 +27,10 @@ from vpsto_ros.contact.disc_steps import (
     summary,
 )
 
+TOUCHING = 1e-4
+"""Gap [m] up to which a particle that was pushed in a step still has its contact: sliding along a round end
+effector leads away from it by the square of the way."""
+
 
 @njit(**VECTORISED)
 def spread(table, count):
@@ -158,7 +162,7 @@ def _perturb(table, count, effectors, step_variance, way_variance, rng):
         contacts, tx, ty = 0, 0.0, 0.0
         for e in range(effectors.shape[0]):
             gap, nx, ny = gap_normal(effectors, e, x, y)
-            if gap < 1e-6:
+            if gap < TOUCHING:
                 contacts += 1
                 tx, ty = -ny, nx
         if contacts == 1:
