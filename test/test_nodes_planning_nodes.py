@@ -407,7 +407,7 @@ def test_bad_messages_are_refused_and_planning_goes_on(planner, message, reason)
     planner.advance(0.4, each=drive(planner))
     give_goal(planner)
     planner.advance(0.1, each=drive(planner))
-    goal = planner.node.goal
+    goal = planner.node.task.goal.latest
     topic, content = message(planner)
     if topic == "goal_pose" and not reason:
         content.pose.orientation.w, reason = 0.0, "quaternion is zero"
@@ -416,7 +416,7 @@ def test_bad_messages_are_refused_and_planning_goes_on(planner, message, reason)
     assert planner.node.complaints.counts[topic] == 1 and reason in planner.node.complaints.recent(60.0)
     before = len(planner.received["joint_trajectory"])
     planner.advance(0.3, each=drive(planner))
-    assert len(planner.received["joint_trajectory"]) > before and planner.node.goal is goal
+    assert len(planner.received["joint_trajectory"]) > before and planner.node.task.goal.latest is goal
 
 
 def test_the_arm_stops_when_the_camera_is_silent_and_goes_on_when_it_returns(planner):
@@ -548,7 +548,8 @@ def test_a_message_from_the_future_is_refused(planner):
     for topic in ("joint_states", "object_state", "contact_plan"):
         assert planner.node.complaints.counts[topic] == 1, topic
     assert "in the future" in planner.node.complaints.recent(60.0)
-    assert planner.node.joints is None and planner.node.object is None and planner.node.contact is None
+    assert planner.node.arm.joints is None and planner.node.task.object is None
+    assert planner.node.task.contact is None
 
 
 def test_a_contact_planner_refuses_the_future_too(bench):
@@ -564,7 +565,7 @@ def test_a_contact_planner_refuses_the_future_too(bench):
         made.send(topic, message)
     made.advance(0.05)
     assert made.node.complaints.counts["joint_states"] == made.node.complaints.counts["object_state"] == 1
-    assert made.node.tool is None and made.node.object is None
+    assert made.node.tool is None and made.node.task.object is None
 
 
 @pytest.mark.parametrize(

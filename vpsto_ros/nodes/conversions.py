@@ -133,7 +133,7 @@ def observation_message(
     """A measured planar pose (3,) and its covariance (3, 3) over (x, y, yaw)."""
     message = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame))
     message.pose.pose = planar_pose(pose)
-    message.pose.covariance = _spread(covariance)
+    message.pose.covariance = spread_covariance(covariance)
     return message
 
 
@@ -144,7 +144,7 @@ def read_observation(message: PoseWithCovarianceStamped, frame: str) -> tuple[Po
         InvalidInputError: wrong frame, broken quaternion, non-finite numbers or a covariance that is none.
     """
     require_frame(message.header, frame)
-    covariance = _gathered(message.pose.covariance)
+    covariance = read_planar_covariance(message.pose.covariance)
     if not covariance.any():
         return read_pose(message.pose.pose), None
     if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() <= 0.0:
@@ -168,10 +168,10 @@ def state_message(
     into = _rotation(-state.pose[2])
     twist = into @ state.twist
     message.pose.pose = planar_pose(state.pose)
-    message.pose.covariance = _spread(state.covariance[:3, :3])
+    message.pose.covariance = spread_covariance(state.covariance[:3, :3])
     message.twist.twist.linear.x, message.twist.twist.linear.y = float(twist[0]), float(twist[1])
     message.twist.twist.angular.z = float(twist[2])
-    message.twist.covariance = _spread(into @ state.covariance[3:, 3:] @ into.T)
+    message.twist.covariance = spread_covariance(into @ state.covariance[3:, 3:] @ into.T)
     return message
 
 
@@ -188,19 +188,15 @@ def read_state(message: Odometry, time_base: TimeBase, frame: str) -> ObjectStat
     twist = np.array([velocity.linear.x, velocity.linear.y, velocity.angular.z])
     require_finite("twist", twist)
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = _gathered(message.pose.covariance)
-    covariance[3:, 3:] = out @ _gathered(message.twist.covariance) @ out.T
+    covariance[:3, :3] = read_planar_covariance(message.pose.covariance)
+    covariance[3:, 3:] = out @ read_planar_covariance(message.twist.covariance) @ out.T
     return ObjectState(time_base.seconds(message.header.stamp), pose, out @ twist, covariance)
 
 
-def belief_message(
-    state: ObjectState, count: int, rng: np.random.Generator, time_base: TimeBase, frame: str
-) -> PoseArray:
-    """Equally weighted samples of the object's pose."""
-    factor = np.linalg.cholesky(state.covariance[:3, :3] + 1e-18 * np.eye(3))
-    samples = state.pose + rng.standard_normal((count, 3)) @ factor.T
-    message = PoseArray(header=Header(stamp=time_base.stamp(state.stamp), frame_id=frame))
-    message.poses = [planar_pose(sample) for sample in samples]
+def belief_message(poses: NDArray, stamp: Time, frame: str) -> PoseArray:
+    """Equally likely planar poses (M, 3) of an object."""
+    message = PoseArray(header=Header(stamp=stamp, frame_id=frame))
+    message.poses = [planar_pose(pose) for pose in poses]
     return message
 
 
@@ -225,7 +221,7 @@ def contact_message(plan: ContactPlan, time_base: TimeBase, frame: str, tool_fra
     message.pose.pose = planar_pose(np.append(plan.position, 0.0))
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = plan.covariance
-    message.pose.covariance = _spread(covariance)
+    message.pose.covariance = spread_covariance(covariance)
     message.twist.twist.linear.x, message.twist.twist.linear.y = map(float, plan.velocity)
     return message
 
@@ -239,7 +235,7 @@ def read_contact(message: Odometry, time_base: TimeBase, frame: str) -> ContactP
     require_frame(message.header, frame)
     position = message.pose.pose.position
     velocity = message.twist.twist.linear
-    covariance = _gathered(message.pose.covariance)[:2, :2]
+    covariance = read_planar_covariance(message.pose.covariance)[:2, :2]
     stamp = time_base.seconds(message.header.stamp)
     require_finite("contact plan", covariance)
     return ContactPlan(
@@ -252,14 +248,19 @@ def _rotation(angle: float) -> NDArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _spread(covariance: NDArray) -> NDArray:
+def spread_covariance(covariance: NDArray) -> NDArray:
     """A (3, 3) covariance over (x, y, yaw) as the 36 entries of a message."""
     full = np.zeros((6, 6))
     full[np.ix_(_PLANAR, _PLANAR)] = covariance
     return full.ravel()
 
 
-def _gathered(covariance: Sequence[float]) -> NDArray:
+def read_planar_covariance(covariance: Sequence[float]) -> NDArray:
+    """The (3, 3) covariance over (x, y, yaw) in the 36 entries of a message.
+
+    Raises:
+        InvalidInputError: a number is not finite.
+    """
     full = np.asarray(covariance, dtype=float).reshape(6, 6)[np.ix_(_PLANAR, _PLANAR)]
     require_finite("covariance", full)
     return full

@@ -229,6 +229,10 @@ class ManagedNode(LifecycleNode):
             self._time_jumped.clear()
             self.complaints.add("clock_reset", "the clock went backwards (a restart?): starting afresh")
             self.on_time_reset()
+        return self.clock_seconds()
+
+    def clock_seconds(self) -> float:
+        """The same without looking whether the clock went backwards [s]."""
         return self.time_base.seconds(self.get_clock().now().to_msg())
 
     def advertise(self, kind: type, topic: str, qos: QoSProfile) -> Any:

@@ -19,6 +19,8 @@ from vpsto_ros.robot.kinematics import (
     UPPER_ARM,
     WRIST_OFFSET,
 )
+from vpsto_ros.robot.tip_kinematics import BALL_BASES
+from vpsto_ros.robot.tool_plane import ToolPlane
 
 ROBOT = (0.85, 0.87, 0.9, 1.0)
 OBJECT = (0.93, 0.58, 0.16, 1.0)
@@ -26,6 +28,7 @@ ESTIMATE = (0.95, 0.8, 0.2, 1.0)
 GOAL = (0.16, 0.66, 0.36, 1.0)
 PLAN = (0.15, 0.4, 0.9, 1.0)
 PREDICTION = (0.75, 0.3, 0.7, 1.0)
+_RING = np.linspace(0.0, 2.0 * np.pi, 25)
 
 # Along the arm, from one joint to the next: rotation about x [rad], then the offset (along x before it) [m].
 _HALF = 0.5 * np.pi
@@ -51,6 +54,19 @@ def arm_points(q: NDArray) -> NDArray[np.float64]:
     return np.array(points)
 
 
+def arm_lines(tools: ToolPlane, q: NDArray) -> list[NDArray[np.float64]]:
+    """Each arm of a robot as a polyline (P, 3) [m], from its base by a crank, if it has one, to the tip."""
+    tips = tools.tips(q)
+    bases = BALL_BASES if len(tips) == 2 else np.zeros((1, 3))
+    lines = []
+    for base, joints, tip in zip(bases, np.split(np.asarray(q), len(tips)), tips, strict=True):
+        points = base + arm_points(joints)
+        flange, axis = points[-2], (points[-1] - points[-2]) / TOOL_LENGTH
+        corner = tip - axis * (axis @ (tip - flange))
+        lines.append(np.vstack([points[:-1], corner, tip]))
+    return lines
+
+
 class MarkerFactory:
     """Makes markers of one node: same frame, same stamp, numbered by their names."""
 
@@ -65,6 +81,33 @@ class MarkerFactory:
         if len(points) < 2:
             marker.action = Marker.DELETE
         return marker
+
+    def robot(self, tools: ToolPlane, q: NDArray) -> list[Marker]:
+        """The arms of a robot at joint positions (n,) [rad]: "robot", "robot_1" ..."""
+        lines = enumerate(arm_lines(tools, q))
+        return [self.line(f"robot_{i}" if i else "robot", points, ROBOT, 0.03) for i, points in lines]
+
+    def paths(self, name: str, coordinates: NDArray, colour: Sequence[float]) -> Marker:
+        """Paths of all tools on the table, given their plane coordinates (K, m)."""
+        pieces = [np.stack([path[:-1], path[1:]], axis=1) for path in tool_paths(coordinates)]
+        return self._segments(name, np.concatenate(pieces).reshape(-1, 2), colour)
+
+    def ellipses(
+        self, name: str, centers: NDArray, covariances: NDArray, colour: Sequence[float]
+    ) -> Marker:
+        """The ellipses of one standard deviation of Gaussians on the table, (E, 2) and (E, 2, 2) [m, m^2]."""
+        circle = np.stack([np.cos(_RING), np.sin(_RING)], axis=1)
+        rings = [
+            center + circle @ np.linalg.cholesky(covariance + 1e-12 * np.eye(2)).T
+            for center, covariance in zip(centers, covariances, strict=True)
+        ]
+        pieces = [np.stack([ring[:-1], ring[1:]], axis=1).reshape(-1, 2) for ring in rings]
+        return self._segments(name, np.concatenate([np.zeros((0, 2)), *pieces]), colour)
+
+    def circles(self, name: str, centers: NDArray, radii: NDArray, colour: Sequence[float]) -> Marker:
+        """Circles on the table, (E, 2) and (E,) [m]."""
+        covariances = np.square(radii)[:, None, None] * np.eye(2)
+        return self.ellipses(name, centers[: len(radii)], covariances, colour)
 
     def shape(
         self,
@@ -103,12 +146,27 @@ class MarkerFactory:
         marker.text = text
         return marker
 
+    def _segments(self, name: str, ends: NDArray, colour: Sequence[float]) -> Marker:
+        """Segments between each two ends, shape (2 S, 2) on the table [m]; without any it vanishes."""
+        marker = self._marker(name, Marker.LINE_LIST, colour)
+        marker.scale.x = 0.003
+        marker.points = _points(ends)
+        if not len(ends):
+            marker.action = Marker.DELETE
+        return marker
+
     def _marker(self, name: str, kind: int, colour: Sequence[float]) -> Marker:
         marker = Marker(ns=name, type=kind, action=Marker.ADD)
         marker.header.frame_id, marker.header.stamp = self.frame, self.stamp
         marker.color = ColorRGBA(**dict(zip("rgba", map(float, colour), strict=True)))
         marker.pose.orientation.w = 1.0
         return marker
+
+
+def tool_paths(coordinates: NDArray) -> list[NDArray]:
+    """Paths (K, 2) of the tools in their plane coordinates (K, m): one for 2 or 3 columns, two for 4."""
+    count = coordinates.shape[1] // 2
+    return [coordinates[:, 2 * tool : 2 * tool + 2] for tool in range(count)]
 
 
 def _points(points: NDArray) -> list[Point]:

@@ -5,7 +5,9 @@ import dataclasses
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.lifecycle import NodeConfig
+from vpsto_ros.nodes.robots import PUSHING, ROBUST_PUSHING, TASKS, BeliefModelConfig, RobotConfig, check_task
 from vpsto_ros.nodes.scene import ModelConfig
+from vpsto_ros.planning.belief_space.config import RobustMpcConfig
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
 
 TRANSPORT = 0.004
@@ -16,13 +18,19 @@ _CYCLE_SHARE, _LEAD_SHARE = 0.9, 0.7  # of the cycle and of the lead that the au
 @documented
 @dataclasses.dataclass(frozen=True)
 class MpcPlannerConfig(NodeConfig):
-    """Parameters of the planner."""
+    """Parameters of the planner; those of ``planner`` or those of ``robust`` count, as ``kind`` says."""
 
+    kind: str = option(
+        PUSHING,
+        "how to push: pushing, with the rod by an estimate of the object (planner.*), or robust_pushing, "
+        "with the tools of any robot by a belief over the object (robust.*, belief.*)",
+        choices=TASKS,
+    )
     rate: float = option(20.0, "planning rate", unit="Hz", minimum=1.0, maximum=50.0)
     deadline: float = option(
         0.0,
         "a plan not ready so long after the start of its cycle is dropped; 0 takes the smaller of 0.9 cycles "
-        "and 0.7 planner.lead",
+        "and 0.7 of the lead (planner.lead or robust.lead)",
         unit="s",
         minimum=0.0,
         maximum=1.0,
@@ -42,13 +50,17 @@ class MpcPlannerConfig(NodeConfig):
     )
     goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
     marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
-    seed: int = option(0, "seed of the search", minimum=0)
+    seed: int = option(0, "seed of the search, and of what is drawn for every belief", minimum=0)
+    robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+    belief: BeliefModelConfig = dataclasses.field(default_factory=BeliefModelConfig)
     planner: PushingMpcConfig = dataclasses.field(default_factory=PushingMpcConfig)
+    robust: RobustMpcConfig = dataclasses.field(default_factory=RobustMpcConfig)
 
     def __post_init__(self) -> None:
         validate(self)
-        deadline, latest = self.deadline_in_force, self.planner.lead - TRANSPORT
+        check_task(self.kind, self.robot, self.goal_orientation)
+        deadline, latest = self.deadline_in_force, self.lead - TRANSPORT
         name = f"deadline = {deadline:g} s" if self.deadline else f"deadline = 0 (here {deadline:g} s)"
         if deadline > 1.0 / self.rate + 1e-9:
             raise ConfigurationError(
@@ -57,18 +69,32 @@ class MpcPlannerConfig(NodeConfig):
             )
         if deadline > latest + 1e-9:
             raise ConfigurationError(
-                f"{name} is more than planner.lead = {self.planner.lead:g} s less {TRANSPORT:g} s for the "
+                f"{name} is more than {self._lead_name} = {self.lead:g} s less {TRANSPORT:g} s for the "
                 "way to the controller, so every plan would come late; lower it, set it to 0 "
-                "or raise planner.lead"
+                f"or raise {self._lead_name}"
             )
         if self.reserve >= deadline:
             raise ConfigurationError(
                 f"reserve = {self.reserve:g} s must be below {name}: nothing would be left for the search "
-                f"(planner.lead = {self.planner.lead:g} s, rate = {self.rate:g} Hz)"
+                f"({self._lead_name} = {self.lead:g} s, rate = {self.rate:g} Hz)"
             )
+
+    @property
+    def lead(self) -> float:
+        """Time between the start of planning and the moment a plan takes over [s]."""
+        return self.robust.lead if self.kind == ROBUST_PUSHING else self.planner.lead
+
+    @property
+    def joint_tolerance(self) -> float:
+        """How far a joint may be from its reference [rad]."""
+        robust = self.kind == ROBUST_PUSHING
+        return self.robust.joint_tolerance if robust else self.planner.joint_tolerance
+
+    @property
+    def _lead_name(self) -> str:
+        return "robust.lead" if self.kind == ROBUST_PUSHING else "planner.lead"
 
     @property
     def deadline_in_force(self) -> float:
         """The deadline as given, or the automatic one [s]."""
-        lead = self.planner.lead
-        return self.deadline or min(_CYCLE_SHARE / self.rate, _LEAD_SHARE * lead, lead - TRANSPORT)
+        return self.deadline or min(_CYCLE_SHARE / self.rate, _LEAD_SHARE * self.lead, self.lead - TRANSPORT)

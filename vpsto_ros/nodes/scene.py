@@ -1,18 +1,13 @@
-"""What the nodes are told about the scene: the outline of the object, the tool, the table, the goal."""
+"""What the nodes are told about the scene: the outline of the object, the tool, the table."""
 
 import dataclasses
 import math
-
-import numpy as np
-from geometry_msgs.msg import PoseStamped
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.nodes.conversions import PoseReading, read_goal
-from vpsto_ros.planning.goal import PlanarGoal
-from vpsto_ros.planning.workspace import Workspace
+from vpsto_ros.nodes.conversions import PoseReading
 
 
 @documented
@@ -63,29 +58,6 @@ class ModelConfig:
         radius = self.pressure_radius or None
         tool = PlanarShape.disc(self.tool_radius)
         return PushingModel(self.object.shape(), tool, pressure_radius=radius, friction=self.friction)
-
-
-def goal_on_table(message: PoseStamped, frame: str, orientation: str, workspace: Workspace) -> PlanarGoal:
-    """The goal of a message, if the object may go there.
-
-    Args:
-        message: the goal pose.
-        frame: the base frame.
-        orientation: "use" or "ignore" the yaw of the message.
-        workspace: where the object may be.
-
-    Raises:
-        InvalidInputError: wrong frame, broken numbers, or a goal off the table or out of reach.
-    """
-    goal = read_goal(message, frame, orientation=orientation == "use")
-    if not workspace.contains_object(np.append(goal.position, 0.0)):
-        x, y = goal.position
-        raise InvalidInputError(
-            f"the goal ({x:.3f}, {y:.3f}) m is out of reach or off the table; allowed are "
-            f"x from {workspace.object_x[0]} to {workspace.object_x[1]} and "
-            f"y from {workspace.object_y[0]} to {workspace.object_y[1]} m; the previous goal stays"
-        )
-    return goal
 
 
 @documented

@@ -1,6 +1,5 @@
 """The node between a camera and the planners: object_pose in, object_state and object_belief out."""
 
-import dataclasses
 import math
 from typing import Any
 
@@ -10,56 +9,15 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from visualization_msgs.msg import MarkerArray
 
-from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import ObjectState
-from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import belief_message, read_observation, state_message
-from vpsto_ros.nodes.diagnostics import STALE, Diagnostics, Durations, Rate
-from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
-from vpsto_ros.nodes.scene import TableConfig
-
-
-@documented
-@dataclasses.dataclass(frozen=True)
-class StateEstimatorConfig(NodeConfig):
-    """Parameters of the state estimator."""
-
-    rate: float = option(50.0, "rate at which object_state is kept up", unit="Hz", minimum=1.0, maximum=200.0)
-    belief_rate: float = option(20.0, "rate of object_belief", unit="Hz", minimum=0.1, maximum=100.0)
-    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
-    belief_samples: int = option(50, "poses in object_belief", minimum=1, maximum=2000)
-    fresh: float = option(
-        0.15,
-        "age of the last frame up to which its state goes out as it is",
-        unit="s",
-        minimum=0.0,
-        maximum=5.0,
-    )
-    prediction: float = option(
-        0.3,
-        "time for which frames that stay away are bridged by prediction",
-        unit="s",
-        minimum=0.0,
-        maximum=5.0,
-    )
-    max_age: float = option(1.0, "older frames are refused", unit="s", minimum=0.01, maximum=60.0)
-    max_ahead: float = option(
-        0.1, "frames farther in the future are refused", unit="s", minimum=0.0, maximum=10.0
-    )
-    position_std: float = option(
-        0.005, "standard deviation of x and y where a frame gives none", unit="m", minimum=1e-5, maximum=1.0
-    )
-    yaw_std: float = option(
-        0.05, "standard deviation of yaw where a frame gives none", unit="rad", minimum=1e-5, maximum=3.0
-    )
-    seed: int = option(0, "seed of the belief's samples", minimum=0)
-    table: TableConfig = dataclasses.field(default_factory=TableConfig)
-    filter: PlanarKalmanConfig = dataclasses.field(default_factory=PlanarKalmanConfig)
-
-    def __post_init__(self) -> None:
-        validate(self)
+from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate
+from vpsto_ros.nodes.estimators import Bridging, KalmanEstimator, ObjectEstimator, ParticleEstimator
+from vpsto_ros.nodes.lifecycle import ManagedNode, best_effort, latched, reliable, run
+from vpsto_ros.nodes.robots import belief_dynamics
+from vpsto_ros.nodes.state_estimator_config import KALMAN, StateEstimatorConfig
 
 
 class StateEstimator(ManagedNode):
@@ -70,14 +28,12 @@ class StateEstimator(ManagedNode):
     def configure(self, config: StateEstimatorConfig) -> None:
         """Set up filter, topics and timers."""
         self.config = config
-        self.filter = PlanarKalman(config.filter)
-        self.rng = np.random.default_rng(config.seed)
         self._default_covariance = np.diag(
             [config.position_std**2, config.position_std**2, config.yaw_std**2]
         )
         self._update_time, self._rate = Durations(), Rate()
         self.reinitialized = 0
-        self._warm_up()
+        self.estimator = self._make_estimator(config)
         self.on_time_reset()
         self._state_publisher = self.advertise(Odometry, "object_state", reliable(1))
         self._belief_publisher = self.advertise(PoseArray, "object_belief", best_effort(1))
@@ -88,34 +44,36 @@ class StateEstimator(ManagedNode):
         self.every(1.0 / config.marker_rate, self._publish_markers)
         self.diagnostics = Diagnostics(self, self.report)
 
+    def _make_estimator(self, config: StateEstimatorConfig) -> ObjectEstimator:
+        rng, bridging = np.random.default_rng(config.seed), Bridging(config.fresh, config.prediction)
+        if config.kind == KALMAN:
+            return KalmanEstimator(config.filter, bridging, rng)
+        dynamics = belief_dynamics(config.robot, config.model, config.way_variance)
+        made = ParticleEstimator(config.particles, dynamics, config.robot.plane(), bridging, rng)
+        made.listen(self, config.base_frame, config.force_noise, touch=config.touch)
+        return made
+
     def on_time_reset(self) -> None:
         """Forget the object."""
-        self.filter.reset()
-        self._belief = PoseArray()
+        self.estimator.reset()
+        self._belief = np.zeros((0, 3))
         self._last_frame = -math.inf
 
     def cleanup(self) -> None:
         """Stop reporting."""
         self.diagnostics.destroy()
 
-    def state(self, now: float) -> ObjectState | None:
-        """What to publish at `now` [s]: the state at the last frame, predicted if old, None if too old."""
-        state = self.filter.state
-        if state is None:
-            return None
-        ahead = now - state.stamp - self.config.fresh
-        if ahead <= 0.0:
-            return state
-        return self.filter.predict(state.stamp + ahead) if ahead <= self.config.prediction else None
-
     def figures(self) -> dict[str, Any]:
         """Rate, age, compute time and uncertainty of the estimate, and how often it began anew."""
-        state = self.filter.state
+        now = self.now()
+        state, status = self.estimator.state(now), self.estimator.status(now)
         values = {
             "rate_hz": f"{self._rate.take():.2f}",
             "frame_age_s": f"{self._age():.3f}",
             "reinitialized": self.reinitialized,
             **self._update_time.milliseconds("compute"),
+            "filter": f"{status.kind}: {status.reason}" if status.reason else status.kind,
+            **self.estimator.figures(),
         }
         if state is not None:
             values["position_std_mm"] = f"{1e3 * math.sqrt(np.trace(state.covariance[:2, :2]) / 2.0):.3f}"
@@ -124,16 +82,20 @@ class StateEstimator(ManagedNode):
     def health(self) -> tuple[int, str]:
         """Whether frames come and are taken."""
         age = self._age()
+        status = self.estimator.status(self.now())
         if math.isinf(age):
-            return STALE, "no camera frame yet" + self._because()
+            reason = status.reason if status.kind != "tracking" else "no camera frame yet"
+            return STALE, reason + self._because()
         if age > self.config.fresh + self.config.prediction:
             return STALE, f"the camera has been silent for {age:.1f} s" + self._because()
-        return super().health()
+        level, message = super().health()
+        if level == OK and status.kind != "tracking":
+            return WARN, f"{status.kind}: {status.reason}"
+        return level, message
 
     def _age(self) -> float:
-        """Age of the last frame [s], inf without one."""
-        state = self.filter.state
-        return math.inf if state is None else self.now() - state.stamp
+        """Age of the last frame that was used [s], inf without one."""
+        return self.now() - self.estimator.frame_stamp
 
     def _because(self) -> str:
         trouble = self.complaints.recent()
@@ -154,7 +116,7 @@ class StateEstimator(ManagedNode):
             raise InvalidInputError(f"the frame is {now - stamp:.2f} s old (allowed {self.config.max_age} s)")
 
     def _update(self, stamp: float, pose: NDArray, covariance: NDArray) -> None:
-        outcome = self.filter.update(stamp, pose, covariance)
+        outcome = self.estimator.update(stamp, pose, covariance)
         if outcome.kind == "reinitialized":
             self.reinitialized += 1
             self.get_logger().info(f"the object is somewhere else: {outcome.reason}")
@@ -168,29 +130,23 @@ class StateEstimator(ManagedNode):
             self._publish(now)
 
     def _publish(self, now: float) -> None:
-        state = self.state(now)
+        state = self.estimator.state(now)
         if state is not None:
             self._state_publisher.publish(state_message(state, self.time_base, self.config.base_frame))
             self._rate.tick()
 
     def _publish_belief(self) -> None:
-        state = self.state(self.now())
-        if state is not None:
-            count, frame = self.config.belief_samples, self.config.base_frame
-            self._belief = belief_message(state, count, self.rng, self.time_base, frame)
-            self._belief_publisher.publish(self._belief)
+        state: ObjectState | None = self.estimator.state(self.now())
+        if state is None:
+            return
+        self._belief = self.estimator.belief(state, self.config.belief_samples)
+        stamp = self.time_base.stamp(state.stamp)
+        self._belief_publisher.publish(belief_message(self._belief, stamp, self.config.base_frame))
 
     def _publish_markers(self) -> None:
         make = markers.MarkerFactory(self.config.base_frame, self.get_clock().now().to_msg())
-        points = np.array([[pose.position.x, pose.position.y] for pose in self._belief.poses]).reshape(-1, 2)
-        drawn = [make.spheres("object_belief", points, markers.ESTIMATE)]
+        drawn = [make.spheres("object_belief", self._belief[:, :2], markers.ESTIMATE)]
         self._marker_publisher.publish(MarkerArray(markers=drawn))
-
-    def _warm_up(self) -> None:
-        """Compile whatever the first frames would compile."""
-        for index in range(3):
-            self.filter.update(0.02 * index, np.array([0.5, 0.0, 0.0]), self._default_covariance)
-        self.filter.predict(0.2)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -34,7 +34,12 @@ class FollowedPlane:
 
 
 def follow_plane(
-    plane: Trajectory, tool_plane: ToolPlane, *, spacing: float = 0.02, height_tolerance: float = 0.001
+    plane: Trajectory,
+    tool_plane: ToolPlane,
+    *,
+    spacing: float = 0.02,
+    height_tolerance: float = 0.001,
+    cubic: bool = False,
 ) -> FollowedPlane:
     """The joint trajectory of a motion in the plane, exact at knots that are at most `spacing` apart.
 
@@ -48,6 +53,8 @@ def follow_plane(
         tool_plane: maps it to joints.
         spacing: longest time between knots [s].
         height_tolerance: largest allowed distance of a tool from its height [m].
+        cubic: segments are cubics in any case. What replans on the move joins motions where the acceleration
+            jumps, and across a jump a message can carry nothing but cubics.
 
     Raises:
         InvalidInputError: the trajectory has another number of coordinates or steps, or spacing is not
@@ -66,7 +73,7 @@ def follow_plane(
             "the joint limits"
         )
     q, qd, qdd = tool_plane.joint_motion(points, plane(times, 1), plane(times, 2))
-    smooth = _acceleration_is_continuous(plane)
+    smooth = not cubic and _acceleration_is_continuous(plane)
     trajectory = Trajectory.from_points(times, q, qd, qdd if smooth else None)
     stretch = _stretch(trajectory, tool_plane.robot.limits)
     if stretch > 1.0:

@@ -32,11 +32,12 @@ class MpcStep:
         valid: whether it is a plan that works, as opposed to a safe stop.
         message: what happened, in words, for people.
         cost: cost of the plan [s], inf without one.
-        tool_path: planned tool positions, shape (K, 2) [m].
+        tool_path: planned plane coordinates of the tools, shape (K, 2) [m]; (K, 4) for two.
         object_path: predicted object poses, shape (K, 3).
         iterations: iterations of the search.
         plane: solution in the plane, for the next warm start.
         ready_at: nothing is planned before this time [s].
+        spread: standard deviation of the predicted object position, shape (K,) [m], if it was predicted.
     """
 
     trajectory: Trajectory | None
@@ -49,6 +50,7 @@ class MpcStep:
     iterations: int = 0
     plane: Trajectory | None = None
     ready_at: float = -np.inf
+    spread: NDArray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
 
 class ReferencePlanner:

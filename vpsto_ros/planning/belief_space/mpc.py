@@ -26,6 +26,7 @@ from vpsto_ros.robot.tool_plane import ToolPlane
 from vpsto_ros.trajectory import Trajectory, braking_trajectory
 
 _BELIEF_STEP = 0.02  # time between samples of the reference when a belief is carried on [s]
+_KNOTS = 0.06  # between knots of a joint trajectory [s]: within a micrometre of the plane's motion
 _MODES = {True: "robust", False: "deterministic"}
 
 
@@ -227,7 +228,7 @@ class RobustPushingMpc(ReferencePlanner):
 
     def _joint_step(self, now: float, horizon: Horizon) -> MpcStep:
         plane, start = horizon.trajectory, horizon.trajectory.start_time
-        followed = follow_plane(plane, self.tools)
+        followed = follow_plane(plane, self.tools, spacing=_KNOTS, cubic=True)
         moving = np.abs(plane(start, 1)).max() > 1e-6
         if followed.stretch > 1.0 and moving:
             raise InfeasibleError(f"the joints' limits ask for a motion {followed.stretch:.2f} times slower")
@@ -239,7 +240,7 @@ class RobustPushingMpc(ReferencePlanner):
         return MpcStep(
             self._joined(now, followed.trajectory), _MODES[self.config.planning.robust], True, "pushing",
             result.cost, outcome.paths[0], self.prediction, result.iterations,
-            plane if followed.stretch == 1.0 else None,
+            plane if followed.stretch == 1.0 else None, spread=np.sqrt(outcome.prediction.variance[0]),
         )  # fmt: skip
 
     def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
@@ -251,7 +252,7 @@ class RobustPushingMpc(ReferencePlanner):
             return MpcStep(self._joined(now, rest), mode, valid, message)
         brake = braking_trajectory(*self._tools_at(takeover), self.pusher.space.limits, start_time=takeover)
         try:
-            followed = follow_plane(brake, self.tools)
+            followed = follow_plane(brake, self.tools, spacing=_KNOTS, cubic=True)
             joints = followed.trajectory
             if followed.stretch > 1.0:
                 raise InfeasibleError("slower")

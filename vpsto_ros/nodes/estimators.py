@@ -1,0 +1,218 @@
+"""The filters that a state estimator can run, behind one interface: Kalman filters, or particles.
+
+The Kalman filters know nothing of the robot: they follow what the camera says. Particles are pushed along by
+the measured motion of the tools, and can be told what these feel.
+"""
+
+import dataclasses
+import math
+from typing import Any, Protocol
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
+from sensor_msgs.msg import JointState
+
+from vpsto_ros.belief.dynamics import BeliefDynamics
+from vpsto_ros.estimation.measurement import Outcome
+from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
+from vpsto_ros.estimation.particle_filter_config import FilterStatus, ParticleFilterConfig
+from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
+from vpsto_ros.nodes.conversions import require_finite, require_frame
+from vpsto_ros.nodes.joint_conversions import read_joint_state
+from vpsto_ros.nodes.lifecycle import ManagedNode
+from vpsto_ros.robot.tool_plane import ToolPlane
+
+TRACKING = FilterStatus("tracking", "")
+_SEEN = np.array([0.5, 0.0, 0.0])  # an imaginary object, to compile with
+
+
+class ObjectEstimator(Protocol):
+    """What the node asks of a filter; times are in seconds of the node's time base."""
+
+    @property
+    def frame_stamp(self) -> float:
+        """When the last frame that was used is of, -inf without one [s]."""
+
+    def reset(self) -> None:
+        """Forget the object."""
+
+    def update(self, stamp: float, pose: NDArray, covariance: NDArray) -> Outcome:
+        """Take in a measured pose (3,) with its covariance (3, 3)."""
+
+    def state(self, now: float) -> ObjectState | None:
+        """What is known now, None if that is nothing or too old."""
+
+    def belief(self, state: ObjectState, count: int) -> NDArray:
+        """Equally likely poses (count, 3) at the time of a state that was just asked for."""
+
+    def status(self, now: float) -> FilterStatus:
+        """How the filter is doing."""
+
+    def figures(self) -> dict[str, Any]:
+        """What diagnostics show of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bridging:
+    """How long a state goes out without new frames.
+
+    Attributes:
+        fresh: age of the last frame up to which its state goes out as it is [s].
+        prediction: time for which frames that stay away are bridged after that [s].
+    """
+
+    fresh: float
+    prediction: float
+
+
+class KalmanEstimator:
+    """Interacting Kalman filters: the state at the last frame, predicted where frames stay away."""
+
+    def __init__(self, config: PlanarKalmanConfig, bridging: Bridging, rng: np.random.Generator) -> None:
+        """Compile the filter."""
+        self._filter, self._bridging, self._rng = PlanarKalman(config), bridging, rng
+        for index in range(3):
+            self._filter.update(0.02 * index, _SEEN, 1e-4 * np.eye(3))
+        self._filter.predict(0.2)
+        self.reset()
+
+    @property
+    def frame_stamp(self) -> float:
+        """When the last frame that was used is of [s]."""
+        state = self._filter.state
+        return -math.inf if state is None else state.stamp
+
+    def reset(self) -> None:
+        """Forget the object."""
+        self._filter.reset()
+
+    def update(self, stamp: float, pose: NDArray, covariance: NDArray) -> Outcome:
+        """Take in a measured pose."""
+        return self._filter.update(stamp, pose, covariance)
+
+    def state(self, now: float) -> ObjectState | None:
+        """The state at the last frame, predicted if old, None if too old."""
+        state = self._filter.state
+        if state is None:
+            return None
+        ahead = now - state.stamp - self._bridging.fresh
+        if ahead <= 0.0:
+            return state
+        return self._filter.predict(state.stamp + ahead) if ahead <= self._bridging.prediction else None
+
+    def belief(self, state: ObjectState, count: int) -> NDArray:
+        """Samples of the state's Gaussian."""
+        factor = np.linalg.cholesky(state.covariance[:3, :3] + 1e-18 * np.eye(3))
+        return state.pose + self._rng.standard_normal((count, 3)) @ factor.T
+
+    def status(self, now: float) -> FilterStatus:
+        """It has nothing to say beyond the outcomes of its updates."""
+        return TRACKING
+
+    def figures(self) -> dict[str, Any]:
+        """Nothing beyond what is shown anyway."""
+        return {}
+
+
+class ParticleEstimator:
+    """Particles that are pushed along by the tools; a state is of the last measured posture of the robot."""
+
+    def __init__(
+        self,
+        config: ParticleFilterConfig,
+        dynamics: BeliefDynamics,
+        tools: ToolPlane,
+        bridging: Bridging,
+        rng: np.random.Generator,
+    ) -> None:
+        """Compile the filter."""
+        self._tools, self._bridging = tools, bridging
+        self._filter = ObjectParticleFilter(config, dynamics, rng)
+        self._warm_up()
+        self.reset()
+
+    @property
+    def frame_stamp(self) -> float:
+        """When the last frame that was used is of [s]."""
+        return self._frame_stamp
+
+    def listen(self, node: ManagedNode, frame: str, force_noise: float, *, touch: bool) -> None:
+        """Subscribe to what the robot measures.
+
+        Args:
+            node: that listens.
+            frame: the base frame.
+            force_noise: standard deviation of a measured force [N].
+            touch: whether external_wrench is used.
+        """
+
+        def receive_joints(message: JointState) -> None:
+            position, _ = read_joint_state(message, self._tools.robot.joint_names)
+            self.move(node.seconds(message.header.stamp), position)
+
+        def receive_force(message: WrenchStamped) -> None:
+            require_frame(message.header, frame)
+            force = np.array([message.wrench.force.x, message.wrench.force.y])
+            require_finite("force", force)
+            self._filter.touch(node.seconds(message.header.stamp), force, force_noise)
+
+        node.subscribe(JointState, "joint_states", receive_joints)
+        if touch:
+            node.subscribe(WrenchStamped, "external_wrench", receive_force)
+
+    def move(self, stamp: float, joints: NDArray) -> None:
+        """Push the particles to where the tools are at joint positions (n,) [rad]."""
+        if self._filter.predict(stamp, self._tools.tool(joints)) == "accepted":
+            self._moved = stamp
+
+    def reset(self) -> None:
+        """Forget the object and the tools."""
+        self._filter.reset()
+        self._frame_stamp = self._moved = -math.inf
+
+    def update(self, stamp: float, pose: NDArray, covariance: NDArray) -> Outcome:
+        """Take in a measured pose."""
+        outcome = self._filter.update(stamp, pose, covariance)
+        if outcome.kind in ("accepted", "reinitialized"):
+            self._frame_stamp = stamp
+        return outcome
+
+    def state(self, now: float) -> ObjectState | None:
+        """Mean and covariance, None if the object was not seen or the robot not heard for too long."""
+        longest = self._bridging.fresh + self._bridging.prediction
+        if now - self._frame_stamp > longest or now - self._moved > longest:
+            return None
+        return self._filter.state(self._moved)
+
+    def belief(self, state: ObjectState, count: int) -> NDArray:
+        """Particles."""
+        belief = self._filter.belief(state.stamp, count)
+        return np.zeros((0, 3)) if belief is None else belief.poses
+
+    def status(self, now: float) -> FilterStatus:
+        """How the filter is doing."""
+        if not math.isfinite(self._moved):
+            return FilterStatus("uninitialised", "no joint_states yet")
+        return self._filter.status(now)
+
+    def figures(self) -> dict[str, Any]:
+        """How many particles there are."""
+        return {"particles": self._filter.config.particles}
+
+    def _warm_up(self) -> None:
+        """Push an imaginary object, and look at it."""
+        dynamics, tools = self._filter.dynamics, self._tools
+        point = np.zeros(tools.dof)
+        for column in dynamics.effectors.columns:
+            point[column : column + 2] = 0.4, 0.1 - 0.1 * column
+        tools.tool(tools.joints(point[None])[0])
+        for index in range(8):
+            point = point + 0.002
+            self._filter.predict(0.01 * index, point)
+            pose = _SEEN + np.array([0.004 * index, 0.0, 0.0])
+            self._filter.update(0.01 * index, pose, 1e-6 * np.eye(3))
+            self._filter.touch(0.01 * index, np.array([2.0, 0.0]), 0.1)
+        self._filter.belief(0.08, 10)
+        self._filter.state(0.08)
