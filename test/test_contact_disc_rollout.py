@@ -395,13 +395,35 @@ def project_numpy(effectors, row, point):
     return best, True
 
 
-@pytest.mark.parametrize("name", EFFECTORS)
-def test_predictions_equal_those_of_a_twin_that_never_skips(name):
-    """Far, near and far again: bounds on the clearance must not miss a contact."""
+def to_and_fro(name):
+    """Far, near and far again."""
+    out = random_path(name, 7, 40)
+    return np.vstack([out, out[::-1][1:] + 0.002, out[1:] + 0.01])
+
+
+def one_after_the_other(name):
+    """The first end effector pushes the object towards the second one, which pushes it aside afterwards."""
+    path = random_path(name, 7, 60)
+    x = np.linspace(-0.1, 0.0, 31)
+    path[:31, :2], path[31:, :2] = np.stack([x, 0.1 * x], axis=1), [-0.12, 0.0]
+    column, disc = EFFECTORS[name].columns[1], isinstance(EFFECTORS[name].shapes[1], Disc)
+    path[:, column], path[:, column + 1] = (0.08 if disc else 0.13), (0.12 if disc else 0.22)
+    path[31:, column + 1] -= np.linspace(0.0, 0.05, 30)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        *((to_and_fro, name) for name in EFFECTORS),
+        *((one_after_the_other, name) for name in ("two discs", "unequal discs", "mixed")),
+    ],
+)
+def test_predictions_equal_those_of_a_twin_that_never_skips(make, name):
+    """Bounds on the clearance must not miss a contact."""
     model, effectors = dynamics(name), EFFECTORS[name]
     positions = np.random.default_rng(6).normal(0.0, 0.012, (6, 2))
-    out = random_path(name, 7, 40)
-    path = np.vstack([out, out[::-1][1:] + 0.002, out[1:] + 0.01])
+    path = make(name)
     mean, variance, contact, longest = [positions.mean(axis=0)], [], [], 0.0
     particles = positions.copy()
     for row in path[1:]:

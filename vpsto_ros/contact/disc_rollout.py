@@ -11,6 +11,7 @@ from vpsto_ros.contact.disc_steps import (
     CLEAR,
     EFFECTOR_COLUMNS,
     FARTHEST,
+    MU,
     STATE_ROWS,
     TABLE_ROWS,
     TOUCHED,
@@ -47,6 +48,7 @@ def spread(table, count):
 
 @njit(**VECTORISED)
 def _all_alike(table, count):
+    """Whether all particles are in the same place, bit by bit."""
     same = True
     for i in range(1, count):
         same = same and table[X, i] == table[X, 0] and table[Y, i] == table[Y, 0]
@@ -183,5 +185,5 @@ def table_of(poses, friction, center) -> np.ndarray:
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     table[X], table[Y], table[YAW] = poses[:, 0], poses[:, 1], poses[:, 2]
     table[BX], table[BY] = c * center[:, 0] - s * center[:, 1], s * center[:, 0] + c * center[:, 1]
-    table[STATE_ROWS - 1] = friction
+    table[MU] = friction
     return table

@@ -67,21 +67,14 @@ def _polar(dx, dy):
     return length if some else 0.0, dx / length if some else 1.0, dy / length if some else 0.0
 
 
-@njit(**VECTORISED, inline="always")
-def _gap_normal(x, y, ex, ey, c, s, hx, hy, grown):
-    """Gap of the point (x, y) to a grown end effector and the unit normal that leads away from it."""
-    dx, dy = x - ex, y - ey
-    gap, nx, ny, _, _ = _nearest(c * dx + s * dy, c * dy - s * dx, hx, hy, grown)
-    return gap, c * nx - s * ny, s * nx + c * ny
-
-
 @njit(**VECTORISED)
 def gap_normal(effectors, e, x, y):
-    """Gap of the point (x, y) to end effector e and the unit normal that leads away from it."""
-    return _gap_normal(
-        x, y, effectors[e, EX], effectors[e, EY], effectors[e, EC], effectors[e, ES],
-        effectors[e, HX], effectors[e, HY], effectors[e, GROWN],
+    """Gap of the point (x, y) to grown end effector e and the unit normal that leads away from it."""
+    dx, dy, c, s = x - effectors[e, EX], y - effectors[e, EY], effectors[e, EC], effectors[e, ES]
+    gap, nx, ny, _, _ = _nearest(
+        c * dx + s * dy, c * dy - s * dx, effectors[e, HX], effectors[e, HY], effectors[e, GROWN]
     )  # fmt: skip
+    return gap, c * nx - s * ny, s * nx + c * ny
 
 
 @njit(**VECTORISED)
