@@ -44,6 +44,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.pushing.planning_space",
         "search in the plane of the tool or in the seven joints",
     ),
+    "particle_filter": Choice(
+        "sim_bridge.experiments.estimation.particle_filter",
+        "where a pushed can is while the camera sees nothing, with touch and without",
+    ),
     "clutter_2d": Choice(
         "sim_bridge.experiments.clutter.clutter_2d",
         "a point among three obstacles: ways found, time, success",

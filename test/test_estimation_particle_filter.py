@@ -305,7 +305,7 @@ def feel(tracker, world, t, point, velocity):
     return tracker.touch(t, -1.5 * here.normals[0, 0] if touching else np.zeros(2), 0.1)
 
 
-def approach(seed, with_touch, std=0.015, shape=CAN):
+def approach(seed, with_touch, std=0.02, shape=CAN):
     """The camera has seen the object once, badly; then the ball comes and pushes it for 2 cm."""
     model = dynamics(shape)
     world = World(seed, model, (0.5, 0.0, 0.2))
@@ -331,7 +331,7 @@ def test_touch_narrows_the_belief_while_the_camera_is_off(shape):
     along = {touch: np.sqrt(np.mean([off[0] ** 2 for _, off in runs[touch]])) for touch in runs}
     variance = {touch: np.mean([value for value, _ in runs[touch]]) for touch in runs}
     assert along[True] < 0.5 * along[False]
-    assert variance[True] < 0.75 * variance[False]
+    assert variance[True] < 0.5 * variance[False]
 
 
 def test_no_contact_rules_out_what_would_have_been_pushed():
@@ -348,10 +348,10 @@ def test_no_contact_rules_out_what_would_have_been_pushed():
 
 
 def test_contact_draws_particles_to_the_manifold_even_if_none_was_there():
-    tracker = started(std=0.004, point=[0.408, 0.0])  # the gap is 12 mm, three standard deviations
-    tracker.predict(0.01, [0.4085, 0.0])
+    tracker = started(std=0.004, point=[0.412, 0.0])  # the gap is 8 mm, two standard deviations
+    tracker.predict(0.01, [0.4125, 0.0])
     assert tracker.touch(0.01, [-1.5, 0.0], 0.1) == "accepted"
-    gaps = particle_contacts(tracker.dynamics, tracker.belief(0.01).poses, [0.4085, 0.0], np.zeros(2)).gaps
+    gaps = particle_contacts(tracker.dynamics, tracker.belief(0.01).poses, [0.4125, 0.0], np.zeros(2)).gaps
     assert np.mean(gaps < 6e-3) > 0.9
     # Ten times as far it is no contact with this object.
     far = started(std=0.004, point=[0.3, 0.0])

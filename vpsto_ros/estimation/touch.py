@@ -32,7 +32,7 @@ class TouchConfig:
         3.0, "and how many standard deviations of its noise", minimum=0.0, maximum=20.0
     )
     gap_scale: float = option(
-        0.002, "standard deviation of the gap at which there is contact", unit="m", minimum=1e-5, maximum=0.05
+        0.001, "standard deviation of the gap at which there is contact", unit="m", minimum=1e-5, maximum=0.05
     )
     pushing_speed: float = option(
         0.01, "speed towards the object above which contact means force", unit="m/s", minimum=1e-4,
@@ -41,7 +41,7 @@ class TouchConfig:
     resting: float = option(
         0.5, "probability that contact is felt when nothing is pushed", minimum=1e-3, maximum=0.999
     )
-    missed: float = option(0.1, "probability that a push is not felt", minimum=1e-3, maximum=0.999)
+    missed: float = option(0.3, "probability that a push is not felt", minimum=1e-3, maximum=0.999)
     false_alarm: float = option(
         0.005, "probability that a force is felt without contact", minimum=1e-6, maximum=0.5
     )
