@@ -1,0 +1,76 @@
+"""The two belief models that all experiments of this room compare, and the disc they push."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vpsto_ros.belief.dynamics import BeliefDynamics
+from vpsto_ros.belief.particles import ObjectBelief
+from vpsto_ros.contact.end_effectors import EndEffectors
+from vpsto_ros.contact.geometry import PlanarShape
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """How contact is modelled.
+
+    Attributes:
+        name: short.
+        title: for tables and figures.
+        friction: whether particles carry friction in 0..0.5 and a centre of friction, std 0.1 radii.
+        step_variance: variance of the perturbation per step in contact [m^2].
+        way_variance: variance of the perturbation per metre that the object is pushed [m].
+        largest_gain: variance gain that a plan may have; more than 1 where no push keeps to the thesis's
+            bound.
+    """
+
+    name: str
+    title: str
+    friction: bool
+    step_variance: float
+    way_variance: float
+    largest_gain: float = 1.0
+
+    def dynamics(self, radius: float, effectors: EndEffectors) -> BeliefDynamics:
+        """Of a disc among end effectors."""
+        return BeliefDynamics(
+            PlanarShape.disc(radius), effectors, friction=self.friction,
+            step_variance=self.step_variance, way_variance=self.way_variance,
+        )  # fmt: skip
+
+
+THESIS = Model("thesis", "frictionless, noise per step (thesis)", False, 1e-6, 0.0)
+FRICTION = Model("friction", "particles carry friction, noise per way", True, 0.0, 1e-4)
+MODELS = {model.name: model for model in (THESIS, FRICTION)}
+
+
+def disc_belief(
+    center: ArrayLike, std: ArrayLike, radius: float, count: int, rng: np.random.Generator
+) -> ObjectBelief:
+    """A Gaussian belief over a disc; both models get the same one, the frictionless one ignores the friction.
+
+    Args:
+        center: mean position (2,) [m].
+        std: one for x and y, or one for each [m].
+        radius: of the disc [m].
+        count: number of particles.
+        rng: source of randomness.
+    """
+    pose, spread = [*np.asarray(center, dtype=float), 0.0], [*np.broadcast_to(std, 2), 0.0]
+    return ObjectBelief.gaussian(pose, spread, count, rng, friction=(0.0, 0.5), center_std=0.1 * radius)
+
+
+def mean_interval(values: Sequence[float] | NDArray, seed: int = 0) -> tuple[float, float]:
+    """Bootstrapped 95 % confidence interval of a mean over runs."""
+    sample, rng = np.asarray(values, dtype=float), np.random.default_rng(seed)
+    means = sample[rng.integers(0, len(sample), (2000, len(sample)))].mean(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def mean_text(values: Sequence[float] | NDArray, scale: float = 1.0, form: str = ".3f") -> str:
+    """Mean and interval for a table."""
+    low, high = mean_interval(values)
+    return f"{scale * np.mean(values):{form}} ({scale * low:{form}}-{scale * high:{form}})"
