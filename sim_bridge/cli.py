@@ -17,6 +17,7 @@ examples:
   vpsto demo push_box                         an arm pushes a box to a moving target; see output/push_box
   vpsto demo push_box --viewer                the same with a live 3-D view in the browser
   vpsto demo push_box --real-time-factor 0.5  on a slow machine: simulated time runs at half speed
+  vpsto demo bimanual_push                    two arms push a can by a belief; see output/bimanual_push
   vpsto experiment push_box --runs 20         20 random boxes, in lock-step and without ROS
   vpsto experiment push_box --resume          go on with an experiment that was stopped
   vpsto bench --json bench.json               how long search, replanning and simulation take here
@@ -33,7 +34,13 @@ class Choice(NamedTuple):
     summary: str
 
 
-DEMOS = {"push_box": Choice("sim_bridge.demo.push_box", "a simulated FR3 pushes a box to a moving target")}
+DEMOS = {
+    "push_box": Choice("sim_bridge.demo.push_box", "a simulated FR3 pushes a box to a moving target"),
+    "bimanual_push": Choice(
+        "sim_bridge.demo.bimanual_push",
+        "two simulated FR3 push a can by a belief over where it is; a hand moves it away",
+    ),
+}
 EXPERIMENTS = {
     "push_box": Choice(
         "sim_bridge.experiments.pushing.push_box",
@@ -211,7 +218,7 @@ def _demo_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     )
     parser.add_argument(
         "--duration", type=positive, default=90.0, metavar="S",
-        help="simulated seconds for all targets, shared out among them; the demo needs about 35 (default 90)",
+        help="simulated seconds for all that happens, shared out evenly; a demo needs 35 to 50 (default 90)",
     )
     parser.add_argument(
         "--out", default=f"output/{name}", metavar="DIR", type=folder, help=f"results (default output/{name})"

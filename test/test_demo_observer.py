@@ -18,10 +18,15 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.serialization import serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from sim_bridge.demo.bimanual_push import DEMO as BIMANUAL_PUSH
 from sim_bridge.demo.observer import GOAL_REPEAT, Observer, Spinning, moves
 from sim_bridge.demo.processes import ProcessGroup
-from sim_bridge.demo.push_box import Outcome, _give_up, _trouble, _watch, verdict
-from sim_bridge.demo.scenario import Orders, Scenario
+from sim_bridge.demo.push_box import DEMO as PUSH_BOX
+from sim_bridge.demo.push_box import box_scenario
+from sim_bridge.demo.running import _trouble, _watch
+from sim_bridge.demo.scenario import Orders
+from sim_bridge.demo.verdict import Outcome, give_up, verdict
+from sim_bridge.scene import Scene
 from vpsto_ros.exceptions import VpstoError
 from vpsto_ros.nodes.diagnostics import Durations
 
@@ -41,7 +46,7 @@ class Sent(list):
 @pytest.fixture
 def observer():
     rclpy.init()
-    node = Observer(NoBag(), Scenario(np.random.default_rng(0)))
+    node = Observer(NoBag(), box_scenario(np.random.default_rng(0)), Scene().plane())
     yield node
     node.destroy_node()
     rclpy.try_shutdown()
@@ -92,7 +97,7 @@ def test_a_failing_callback_ends_the_watch_with_its_error(observer, tmp_path):
     observer.create_timer(0.01, fail)
     began = time.monotonic()
     with Spinning(observer) as spinning, ProcessGroup(tmp_path, {}) as processes:
-        arguments = (Scenario(np.random.default_rng(0)), lambda _: None, time.monotonic() + 60.0)
+        arguments = (box_scenario(np.random.default_rng(0)), lambda _: None, time.monotonic() + 60.0)
         with pytest.raises(VpstoError, match=r"own node failed: OSError: no space left") as caught:
             _watch(observer, spinning, processes, *arguments)
     assert isinstance(caught.value.__cause__, OSError)
@@ -100,7 +105,7 @@ def test_a_failing_callback_ends_the_watch_with_its_error(observer, tmp_path):
 
 
 def test_a_node_that_dies_before_the_first_step_gives_a_verdict(tmp_path, capsys):
-    outcome = Outcome(Scenario(np.random.default_rng(0)))
+    outcome = Outcome(box_scenario(np.random.default_rng(0)))
     with ProcessGroup(tmp_path / "logs", {}) as processes:
         processes.start("mpc_planner", [sys.executable, "-c", "print('no licence'); raise SystemExit(3)"])
         while not processes.ended():
@@ -108,7 +113,7 @@ def test_a_node_that_dies_before_the_first_step_gives_a_verdict(tmp_path, capsys
         ended = processes.ended()
         processes.stop()
     outcome.trouble += _trouble(processes, ended)
-    assert _give_up(tmp_path, 0, outcome) == 1
+    assert give_up(tmp_path, 0, outcome) == 1
     text = capsys.readouterr().out
     assert text.startswith("FAILED: mpc_planner ended during the run with status 3") and "no licence" in text
     assert '"success": false' in (tmp_path / "summary.json").read_text()
@@ -118,17 +123,20 @@ def test_the_verdict_says_when_the_first_plan_came():
     good = {
         "success": True,
         "failures": [],
-        "phases": [{"name": "target 1", "time_to_reach_s": 3.0}],
+        "phases": [{"name": "target 1", "judged": True, "time_to_reach_s": 3.0}],
+        "reached_distance_m": 0.015,
         "drift": {"median_distance_m": 0.01},
         "final_error_m": 0.002,
         "mpc": {"deadline_misses": 1.0, "cycles": 900.0, "rate_hz": 19.98},
         "time_to_first_plan_s": 2.34,
     }
-    assert "the first plan that moves came 2.3 s after the start" in verdict(good)
-    assert "at 20.0 plans per second" in verdict(good)
+    for demo in (PUSH_BOX, BIMANUAL_PUSH):
+        assert "the first plan that moves came 2.3 s after the start" in verdict(demo, good)
+        assert "within 3.0 s" in verdict(demo, good) and "at 20.0 plans per second" in verdict(demo, good)
+    assert "within 15 mm" in verdict(BIMANUAL_PUSH, good)
     bad = {**good, "success": False, "failures": ["x"]}
-    assert verdict(bad).startswith("FAILED: x; the first plan that moves came 2.3 s")
-    assert "no plan that moves came" in verdict({**bad, "time_to_first_plan_s": float("nan")})
+    assert verdict(PUSH_BOX, bad).startswith("FAILED: x; the first plan that moves came 2.3 s")
+    assert "no plan that moves came" in verdict(PUSH_BOX, {**bad, "time_to_first_plan_s": float("nan")})
 
 
 def test_percentiles_of_a_node_cover_the_longest_usual_scenario():

@@ -1,12 +1,15 @@
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sim_bridge.demo.scenario import Phase, Scenario
+from sim_bridge.demo.push_box import box_scenario
 from sim_bridge.report import recording as rec
 from sim_bridge.report.bag import BagRecorder, read_messages, typestore
+from sim_bridge.report.overlay import LINE_LIST, LINE_STRIP, SPHERE_LIST, overlays_of
+from sim_bridge.report.page import demo_tables
 from sim_bridge.report.recording import Command, JointSeries, PoseSeries, Recording, Status
 from sim_bridge.report.summary import (
     RunFacts,
@@ -19,6 +22,7 @@ from sim_bridge.report.summary import (
 from vpsto_ros.robot.inverse_kinematics import TableMap
 from vpsto_ros.robot.kinematics import fr3_pusher
 
+TOOLS = TableMap(fr3_pusher(), 0.02)
 NAMES = [f"fr3_joint{i}" for i in range(1, 8)]
 
 
@@ -191,20 +195,20 @@ def good_run():
 
 
 def good_story():
-    story = Scenario(np.random.default_rng(0))
+    story = box_scenario(np.random.default_rng(0))
     story.phases = [
-        Phase(phase.name, phase.timeout, i, i + 1.0, i + 0.5)
+        dataclasses.replace(phase, start=i, end=i + 1.0, reached=i + 0.5)
         for i, phase in zip([0.0, 2.0, 4.0, 6.0, 8.0, 9.0], story.phases, strict=True)
     ]
     story.drift_distances = [0.01, 0.02, 0.03]
     return story
 
 
-FACTS = RunFacts(seed=3, first_plan=1.5, elapsed=5.0, trouble=[], tool_height=0.02, planner_rate=20.0)
+FACTS = RunFacts(seed=3, first_plan=1.5, elapsed=5.0, trouble=[], planner_rate=20.0)
 
 
 def test_a_good_run_is_a_success_with_all_promised_figures():
-    summary = summarize(good_run(), good_story(), fr3_pusher(), FACTS)
+    summary = summarize(good_run(), good_story(), TOOLS, FACTS)
     assert summary["success"] and summary["failures"] == []
     assert summary["final_error_m"] == pytest.approx(0.0)
     assert summary["limit_violations"] == 0
@@ -217,7 +221,7 @@ def test_a_good_run_is_a_success_with_all_promised_figures():
 
 
 def test_each_shortcoming_fails_the_run():
-    base = summarize(good_run(), good_story(), fr3_pusher(), FACTS)
+    base = summarize(good_run(), good_story(), TOOLS, FACTS)
     assert failures(base) == []
     late = [
         {**phase, "time_to_reach_s": math.nan} if phase["name"] == "knock" else phase
@@ -241,7 +245,69 @@ def test_each_shortcoming_fails_the_run():
         found = failures({**base, **change})
         assert len(found) == 1 and word in found[0]
     trouble = dataclasses.replace(FACTS, trouble=["mpc_planner exited with status 1"])
-    assert not summarize(good_run(), good_story(), fr3_pusher(), trouble)["success"]
+    assert not summarize(good_run(), good_story(), TOOLS, trouble)["success"]
+
+
+def test_a_strict_verdict_minds_contacts_and_refused_trajectories():
+    run = good_run()
+    kinds = {f"contact.{kind}.steps": "7" for kind in ("arms", "table", "object")}
+    refused = {"rejected.joint_trajectory.jump": "2", "rejected.joint_trajectory.past": "1"}
+    before, after = driver_status(**kinds, **refused), driver_status(**kinds, **refused)
+    run.diagnostics["franka_driver"] = [dataclasses.replace(before, time=-1.0), after]
+    summary = summarize(run, good_story(), TOOLS, FACTS, strict=True)
+    assert summary["success"], "what was before the start is the start's"
+    assert summary["contacts"] == {"arms": 0, "table": 0, "object": 0}
+    assert summary["refused_trajectories"] == 0
+    after.values.update({"contact.arms.steps": "9", "rejected.joint_trajectory.jump": "3"})
+    assert summarize(run, good_story(), TOOLS, FACTS)["success"], "others do not mind"
+    found = summarize(run, good_story(), TOOLS, FACTS, strict=True)["failures"]
+    assert found == ["the arms touched each other for 2 ms", "the controller refused 1 trajectories"]
+    after.values.update({"contact.table.steps": "8", "contact.object.steps": "8"})
+    assert len(summarize(run, good_story(), TOOLS, FACTS, strict=True)["failures"]) == 4
+    run.diagnostics["franka_driver"] = [driver_status()]
+    failed = summarize(run, good_story(), TOOLS, FACTS, strict=True)["failures"]
+    assert failed == ["the driver did not say what the arms touched"]
+
+
+def test_a_scenario_without_a_drift_is_not_judged_by_one():
+    story = good_story()
+    story.phases = [phase for phase in story.phases if phase.judged]
+    summary = summarize(good_run(), story, TOOLS, FACTS)
+    assert summary["success"] and "drift" not in summary
+    assert all("drift" not in row[0] for _, rows in demo_tables(summary) for row in rows)
+
+
+def marker(name, kind, *points, action=0):
+    vector = [message("geometry_msgs/msg/Point", x=x, y=y, z=z) for x, y, z in points]
+    colour, scale = SimpleNamespace(r=0.1, g=0.2, b=0.3), SimpleNamespace(x=0.004)
+    return SimpleNamespace(ns=name, type=kind, action=action, points=vector, color=colour, scale=scale)
+
+
+def test_what_nodes_draw_becomes_lines_and_points():
+    corners = [(0.4, 0.0, 0.003), (0.5, 0.0, 0.003), (0.5, 0.1, 0.003), (0.6, 0.1, 0.003)]
+    drawn = [
+        marker("path", LINE_STRIP, *corners),
+        marker("rings", LINE_LIST, *corners),
+        marker("object_belief", SPHERE_LIST, *corners),
+        marker("gone", LINE_STRIP, *corners, action=2),
+        marker("unwanted", LINE_STRIP, *corners),
+        marker("empty", LINE_LIST),
+    ]
+    wanted = ("path", "rings", "object_belief", "gone", "empty")
+    path, rings, belief = overlays_of(drawn, wanted, height=0.12)
+    assert path.points.shape == (3, 2, 3) and rings.points.shape == (2, 2, 3) and path.lines
+    assert np.allclose(path.points[1, 0], path.points[0, 1])
+    assert belief.points.shape == (4, 3) and not belief.lines
+    assert belief.points[0, 2] > 0.12 > path.points[0, 0, 2], "below the object it would be hidden"
+    assert path.width == 0.004 and path.colour == (0.1, 0.2, 0.3)
+
+
+def test_what_was_drawn_is_shown_until_it_is_old():
+    path = overlays_of([marker("path", LINE_STRIP, (0, 0, 0), (1, 0, 0))], ("path",), 0.0)
+    run = dataclasses.replace(good_run(), drawn={"a": [rec.Drawing(1.0, path), rec.Drawing(1.1, ())]})
+    assert run.overlays(0.9) == () and run.overlays(1.05) == path and run.overlays(1.2) == ()
+    run.drawn["b"] = [rec.Drawing(1.0, path)]
+    assert run.overlays(1.5) == path and run.overlays(3.0) == ()
 
 
 def test_violations_are_counted_wherever_they_happen():
@@ -273,7 +339,7 @@ def test_torques_that_were_asked_for_count_but_not_ramped_ones():
     run.diagnostics["franka_driver"] = [driver_status(**asked)]
     counts = limit_violations(run, robot)
     assert counts["driver_torque"] == 3 and sum(counts.values()) == 3
-    summary = summarize(run, good_story(), robot, FACTS)
+    summary = summarize(run, good_story(), TOOLS, FACTS)
     assert summary["failures"] == ["3 limit violations (driver_torque)"]
     run.diagnostics["franka_driver"] = [driver_status(limit_violations="2")]
     assert limit_violations(run, robot)["driver_other"] == 2

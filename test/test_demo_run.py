@@ -80,8 +80,8 @@ def test_no_limit_is_violated(short_run):
 KILLING = """
 import sys, time
 from sim_bridge import cli
-from sim_bridge.demo import push_box
-delay, ready = float(sys.argv.pop(1)), push_box._wait_until_active
+from sim_bridge.demo import running
+delay, ready = float(sys.argv.pop(1)), running._wait_until_active
 
 def wait(observer, spinning, processes):
     ready(observer, spinning, processes)
@@ -91,12 +91,12 @@ def wait(observer, spinning, processes):
         observer._latest.clear()
         time.sleep(0.5)
 
-def act(observer, original=push_box.Observer._act):
+def act(observer, original=running.Observer._act):
     original(observer)
     if delay and observer._scenario.phase.start + delay < observer.simulated_time:
         raise OSError("the disk is full")
 
-push_box._wait_until_active, push_box.Observer._act = wait, act
+running._wait_until_active, running.Observer._act = wait, act
 sys.exit(cli.main())
 """
 

@@ -3,17 +3,19 @@ import math
 import numpy as np
 import pytest
 
-from sim_bridge.demo.scenario import DRIFT_SPEED, Area, Knock, Scenario
+from sim_bridge.demo.bimanual_push import CAN_AREA, CAN_DISTANCE, TABLE_CENTRE, can_scenario
+from sim_bridge.demo.push_box import box_scenario
+from sim_bridge.demo.scenario import DRIFT_SPEED, Area, Knock
 
 TOOL = np.array([0.4, 0.0])
 PERIOD = 0.02
 
 
-def act(scenario, follow, until=400.0):
+def act(scenario, follow, until=400.0, tools=TOOL):
     """Step a scenario; `follow(box, orders)` moves the box. Returns the orders over time."""
     box, now, history = np.array([0.5, 0.0]), 0.0, []
     while not scenario.finished and now < until:
-        orders = scenario.step(now, box, TOOL)
+        orders = scenario.step(now, box, tools)
         history.append((now, orders, box.copy()))
         box = follow(box, orders)
         now += PERIOD
@@ -29,7 +31,7 @@ def obedient(box, orders):
 
 
 def scenario(seed=0, duration=60.0):
-    return Scenario(np.random.default_rng(seed), duration)
+    return box_scenario(np.random.default_rng(seed), duration)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -86,7 +88,7 @@ def test_targets_are_in_the_area_and_a_jump_apart():
 
 
 def test_the_drift_has_its_speed_and_stays_in_the_area():
-    story = Scenario(np.random.default_rng(3), duration=300.0, drift_time=60.0)
+    story = box_scenario(np.random.default_rng(3), duration=300.0, drift_time=60.0)
     goals = np.array([orders.goal for _, orders, _ in act(story, obedient) if orders.goal_moves])
     speeds = np.linalg.norm(np.diff(goals, axis=0), axis=1) / PERIOD
     assert speeds == pytest.approx(DRIFT_SPEED, rel=1e-6)
@@ -141,3 +143,40 @@ def test_the_knock_leaves_the_box_among_the_targets_and_off_the_tool():
         assert 0.05 <= moved <= 0.10
         assert Area((0.42, 0.62), (-0.27, 0.27)).contains(boxes[-1])
         assert np.linalg.norm(boxes - TOOL, axis=1).min() > 0.03
+
+
+BALLS = np.array([[0.4, 0.05], [0.4, -0.05]])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_can_that_obeys_is_brought_back_after_every_knock(seed):
+    story = can_scenario(np.random.default_rng(seed), 90.0)
+    history = act(story, obedient, tools=BALLS)
+    assert story.finished
+    assert [phase.name for phase in story.phases] == ["centre", "knock 1", "knock 2", "elsewhere", "knock 3"]
+    assert all(phase.judged and 0.0 <= phase.time_to_reach < phase.timeout for phase in story.phases)
+    goals = np.unique([orders.goal for _, orders, _ in history], axis=0)
+    assert len(goals) == 2 and any(np.allclose(goal, TABLE_CENTRE) for goal in goals)
+    assert all(CAN_AREA.contains(goal) for goal in goals)
+    assert np.linalg.norm(goals[1] - goals[0]) >= 0.1
+    times = np.array([now for now, orders, _ in history if orders.force is not None])
+    assert np.count_nonzero(np.diff(times) > 1.0) == 2, "three knocks, one after the other"
+
+
+def test_a_knock_is_aimed_away_from_both_tools_and_leaves_the_can_in_its_area():
+    turned = 0
+    for seed in range(30):
+        story = can_scenario(np.random.default_rng(seed), 90.0)
+        history = act(story, obedient, tools=BALLS)
+        forces = [orders.force for _, orders, _ in history if orders.force is not None and orders.force.any()]
+        turned += sum(force[0] < 0.0 for force in forces[:1])
+        boxes = np.array([box for _, _, box in history])
+        assert CAN_AREA.x[0] - 0.03 <= boxes[:, 0].min() and boxes[:, 0].max() <= CAN_AREA.x[1] + 0.03
+    assert turned <= 3, "the hand shoves away from the balls, seldom towards them"
+
+
+def test_a_can_is_there_within_its_distance():
+    story = can_scenario(np.random.default_rng(0), 90.0)
+    for now in np.arange(0.0, 1.05, 0.1):
+        story.step(now, np.array(TABLE_CENTRE) + [CAN_DISTANCE - 1e-4, 0.0], BALLS)
+    assert story.phases[0].reached == 0.0

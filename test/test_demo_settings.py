@@ -1,10 +1,18 @@
 import dataclasses
+from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 
+from sim_bridge.cli import DEMOS
 from sim_bridge.demo import settings as module
-from sim_bridge.demo.settings import Settings, config_file, configured
+from sim_bridge.demo.bimanual_push import CAN_AREA, TABLE_CENTRE
+from sim_bridge.demo.settings import Settings, _parameters, config_file, configured
 from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.nodes.contact_planner_config import ContactPlannerNodeConfig
+from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +43,32 @@ def test_the_demo_s_file_fits_the_nodes_and_says_what_is_drawn():
     assert settings.scene.plant.shape.bounding_radius == pytest.approx(0.5 * 0.12 * 2**0.5)
     assert settings.scene.tool_height == settings.planner.planner.tool_height
     assert settings.planner_rate == 20.0
+
+
+def test_the_bimanual_demo_s_file_fits_all_nodes_and_they_agree():
+    settings = Settings.load("bimanual_push", seed=3, real_time_factor=1.0)
+    content = yaml.safe_load(settings.file.read_text())
+    nodes = {
+        "state_estimator": StateEstimatorConfig(),
+        "contact_planner": ContactPlannerNodeConfig(),
+        "mpc_planner": MpcPlannerConfig(),
+    }
+    configs = {name: configured(default, _parameters(content, name)) for name, default in nodes.items()}
+    assert {config.robot.kind for config in configs.values()} == {settings.scene.robot} == {"two_balls"}
+    assert len({config.model.object for config in configs.values()}) == 1
+    assert configs["mpc_planner"].model.object.shape() == settings.scene.plant.shape
+    assert configs["mpc_planner"].robot.plane().height == settings.tools.height == settings.scene.height
+    assert configs["mpc_planner"].kind == configs["contact_planner"].kind == "robust_pushing"
+    space = configs["mpc_planner"].robust
+    corners = [np.array([x, y]) for x in CAN_AREA.x for y in CAN_AREA.y]
+    assert all(space.contains(np.array(point)) for point in (TABLE_CENTRE, *corners))
+
+
+@pytest.mark.parametrize("name", DEMOS)
+def test_every_demo_has_parameters_and_a_launch_file_that_names_them(name):
+    root = Path(__file__).resolve().parents[1]
+    assert (root / "config" / f"{name}.yaml").exists()
+    assert f"{name}.yaml" in (root / "launch" / f"{name}.launch.py").read_text()
 
 
 def test_nodes_get_file_seed_and_clock():

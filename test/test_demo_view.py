@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sim_bridge.report import video
+from sim_bridge.report.overlay import Overlay
 from sim_bridge.report.page import number, write_page
 from sim_bridge.report.view import Frame, ModelState, replay_page
 from sim_bridge.scene import Scene, build
@@ -36,10 +37,13 @@ def test_without_a_target_none_is_seen(model, target):
 
 def test_the_replay_is_one_page_that_loads_nothing(model):
     joints = Scene().joints()
-    path = np.linspace([0.4, 0.0], [0.5, 0.1], 30)
-    frames = [
-        Frame(joints + 0.01 * i, np.array([0.5, 0.01 * i, 0.0]), np.array([0.6, 0.0]), path) for i in range(5)
-    ]
+    path = np.linspace([0.4, 0.0, 0.01], [0.5, 0.1, 0.01], 30)
+    plan = Overlay("planned_tool_path", np.stack([path[:-1], path[1:]], axis=1), (0.1, 0.4, 0.9), 0.003)
+    cloud = Overlay("object_belief", path, (0.9, 0.8, 0.2), 0.006)
+    overlays = [(plan, cloud)[: i % 3] for i in range(5)]
+    poses = [np.array([0.5, 0.01 * i, 0.0]) for i in range(5)]
+    target = np.array([0.6, 0.0])
+    frames = [Frame(joints + 0.01 * i, poses[i], target, overlays[i]) for i in range(5)]
     page = replay_page(model, fr3_pusher().joint_names, frames, 20.0)
     assert "__VISER_EMBED_DATA__" in page
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=\"(?!data:)", page)

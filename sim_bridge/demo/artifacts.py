@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_bridge.demo.settings import Settings
 from sim_bridge.report.charts import compute_chart, distance_chart, joint_chart, top_view
@@ -17,13 +16,13 @@ from sim_bridge.report.summary import PLANNER
 from sim_bridge.report.video import write_video
 from sim_bridge.report.view import Frame, replay_page
 from sim_bridge.scene import build
-from vpsto_ros.robot.kinematics import forward_kinematics_batch, fr3_pusher
+from vpsto_ros.nodes.markers import arm_bases
 
 FRAME_RATE = 20.0
 
 
 def write_artifacts(
-    out: Path, recording: Recording, summary: Mapping[str, Any], settings: Settings, verdict: str
+    out: Path, recording: Recording, summary: Mapping[str, Any], settings: Settings, verdict: str, title: str
 ) -> list[str]:
     """Write charts, report and video.
 
@@ -33,34 +32,35 @@ def write_artifacts(
         summary: its figures.
         settings: scene and planner rate.
         verdict: plain sentence for the report.
+        title: of the report.
 
     Returns:
         Sentences for the user about what could not be made.
     """
-    robot = fr3_pusher()
-    tool = forward_kinematics_batch(recording.joints.position)[:, :2]
-    shape = settings.scene.plant.shape
+    tools, scene = settings.tools, settings.scene
+    robot = tools.robot
+    marks = ", ".join(dict.fromkeys(phase["name"] for phase in summary["phases"]))
     charts = [
         (
             out / "distance.png",
-            "Distance between box and target. Vertical lines: the target jumps, the knock, the drift.",
+            f"Distance between object and target. Vertical lines: {marks}.",
         ),
         (
             out / "top_view.png",
-            "Seen from above: paths of box, target and tool; box at the start (faint) and at the end.",
+            "Seen from above: paths of object, target and tools; object at the start (faint) and at the end.",
         ),
         (out / "joints.png", "Joint velocities and torques as shares of their limits."),
         (out / "compute.png", "Compute time of a planning step as the planner reports it."),
     ]
-    distance_chart(charts[0][0], recording, summary["phases"])
-    top_view(charts[1][0], recording, tool, shape.transform(np.zeros(3)))
+    distance_chart(charts[0][0], recording, summary["phases"], summary["reached_distance_m"])
+    tips, corners = tools.tips(recording.joints.position), scene.plant.shape.transform(np.zeros(3))
+    top_view(charts[1][0], recording, tips, corners, arm_bases(tools))
     joint_chart(charts[2][0], recording, robot.limits, robot.torque_limits)
     compute_chart(charts[3][0], recording, PLANNER)
     frames = replay_frames(recording, summary["phases"][0]["start_s"])
-    page = replay_page(build(settings.scene), robot.joint_names, frames, FRAME_RATE)
-    title = "A simulated FR3 pushes a box to a moving target"
+    page = replay_page(build(scene), robot.joint_names, frames, FRAME_RATE)
     write_page(out / "report.html", title, verdict, summary["success"], demo_tables(summary), charts, page)
-    note = write_video(out / "video.mp4", settings.scene, robot.joint_names, frames, FRAME_RATE)
+    note = write_video(out / "video.mp4", scene, robot.joint_names, frames, FRAME_RATE)
     return [note] if note else []
 
 
@@ -71,20 +71,5 @@ def replay_frames(recording: Recording, start: float) -> list[Frame]:
     times = np.arange(start, end, 1.0 / FRAME_RATE)
     columns = [np.interp(times, joints.time, column) for column in joints.position.T]
     poses, goals = recording.object.at(times), recording.goal.held(times)
-    plans = planned_paths(recording, times)
-    rows = zip(np.stack(columns, axis=-1), poses, goals[:, :2], plans, strict=True)
-    return [Frame(position, pose, goal, plan) for position, pose, goal, plan in rows]
-
-
-def planned_paths(recording: Recording, times: NDArray[np.float64]) -> list[NDArray[np.float64] | None]:
-    """Paths of the tool's tip (P, 2) [m] ahead in the newest trajectory at each time; None without any."""
-    received = np.array([command.received for command in recording.commands])
-    newest = np.searchsorted(received, times, side="right") - 1
-    paths: list[NDArray[np.float64] | None] = []
-    for time, index in zip(times, newest, strict=True):
-        command = recording.commands[index] if index >= 0 else None
-        ahead = command.position[command.time > time] if command is not None else np.empty((0, 7))
-        path = forward_kinematics_batch(ahead)[:, :2] if len(ahead) > 1 else None
-        moving = path is not None and np.ptp(path, axis=0).max() > 1e-3
-        paths.append(path if moving else None)
-    return paths
+    rows = zip(times, np.stack(columns, axis=-1), poses, goals[:, :2], strict=True)
+    return [Frame(position, pose, goal, recording.overlays(time)) for time, position, pose, goal in rows]

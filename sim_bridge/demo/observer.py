@@ -1,4 +1,4 @@
-"""The demo's own ROS node: records every topic, moves the target, lends the hand that knocks the box."""
+"""A demo's own ROS node: records every topic, moves the target, lends the hand that knocks the object."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ from visualization_msgs.msg import MarkerArray
 
 from sim_bridge.demo.scenario import Orders, Scenario
 from sim_bridge.report.bag import BagRecorder
+from sim_bridge.report.overlay import MARKERS, Overlay, overlays_of
 from sim_bridge.report.recording import GOAL_POSE, GROUND_TRUTH, JOINT_STATES, JOINT_TRAJECTORY, planar
 from vpsto_ros.exceptions import VpstoError
-from vpsto_ros.robot.kinematics import forward_kinematics_batch
+from vpsto_ros.robot.tool_plane import ToolPlane
 
 CLOCK, DISTURBANCE = "/clock", "/disturbance"
 DIAGNOSTICS = "/diagnostics"
@@ -67,15 +68,19 @@ class Observer(Node):
     Messages stay serialised on their way into the bag; only what the scenario or a viewer needs is decoded.
     """
 
-    def __init__(self, bag: BagRecorder, scenario: Scenario, frame: str = "fr3_link0") -> None:
+    def __init__(
+        self, bag: BagRecorder, scenario: Scenario, tools: ToolPlane, frame: str = "fr3_link0"
+    ) -> None:
         """Subscribe to all topics.
 
         Args:
             bag: gets every message.
             scenario: acted out once :meth:`begin` was called.
+            tools: the robot's tools, which the hand avoids.
             frame: of all poses.
         """
         super().__init__("demo")
+        self._tools = tools
         self._bag, self._scenario, self._frame = bag, scenario, frame
         self._latest: dict[str, bytes] = {}
         self._running = False
@@ -113,12 +118,13 @@ class Observer(Node):
         message = self.latest(GROUND_TRUTH)
         return None if message is None else np.array(planar(message.pose.pose))
 
-    def planned_path(self) -> NDArray[np.float64] | None:
-        """The path of the tool's tip (P, 2) [m] in the newest trajectory, or None."""
-        message = self.latest(JOINT_TRAJECTORY)
-        if message is None or len(message.points) < 2:
-            return None
-        return forward_kinematics_batch([point.positions for point in message.points])[:, :2]
+    def overlays(self, height: float) -> tuple[Overlay, ...]:
+        """What the nodes drew last; height is the object's [m]."""
+        found: list[Overlay] = []
+        for topic, wanted in MARKERS.items():
+            message = self.latest(topic)
+            found += overlays_of(message.markers, wanted, height) if message is not None else ()
+        return tuple(found)
 
     def goal(self) -> NDArray[np.float64] | None:
         """The target's position (2,) [m], or None before the first one."""
@@ -158,8 +164,8 @@ class Observer(Node):
             return
         now = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         box = np.array(planar(message.pose.pose)[:2])
-        tool = forward_kinematics_batch(joints[None])[0, :2]
-        self._carry_out(self._scenario.step(now, box, tool), now)
+        tools = self._tools.tips(joints)[:, :2]
+        self._carry_out(self._scenario.step(now, box, tools), now)
 
     def _carry_out(self, orders: Orders, now: float) -> None:
         changed = self._goal is None or not np.allclose(orders.goal, self._goal, atol=1e-9)

@@ -1,4 +1,4 @@
-"""What happens to target and box in the pushing demo: jumps, one knock by hand, a drift. No ROS, no clock."""
+"""What happens to target and object in a demo: jumps, knocks by hand, a drift. No ROS, no clock."""
 
 from __future__ import annotations
 
@@ -44,32 +44,42 @@ class Area:
 
 @dataclass
 class Phase:
-    """One part of the scenario and how it went.
+    """One part of a scenario and how it went.
 
     Attributes:
         name: what happens, in a few words.
         timeout: the longest it may take [s].
+        begins: what happens when it begins: "jump" (of the target), "knock" (by hand), "drift" (of the
+            target, to the end of the phase) or "rest" (nothing).
+        goal: where the target jumps to (2,) [m]; None: somewhere.
         start: when it began [s], NaN before.
         end: when it ended [s], NaN before.
-        reached: when the box had come within reach and stayed there long enough [s], NaN if it never did.
+        reached: when the object had come within reach and stayed there long enough [s], NaN if it never did.
     """
 
     name: str
     timeout: float
+    begins: str = "jump"
+    goal: NDArray[np.float64] | None = None
     start: float = math.nan
     end: float = math.nan
     reached: float = math.nan
 
     @property
+    def judged(self) -> bool:
+        """Whether the object has to reach the target in it."""
+        return self.begins != "drift"
+
+    @property
     def time_to_reach(self) -> float:
-        """From the start of the phase until the box was at the target and stayed [s]; NaN if it never was."""
+        """From the start until the object was at the target and stayed [s]; NaN if it never was."""
         return self.reached - self.start
 
 
 class Knock:
-    """A hand that shoves the box: it holds a speed by a force, until the box has moved far enough.
+    """A hand that shoves the object: it holds a speed by a force, until the object has moved far enough.
 
-    The force grows for as long as the box does not follow, so neither mass nor friction has to be known.
+    The force grows for as long as the object does not follow, so neither mass nor friction has to be known.
     """
 
     def __init__(
@@ -126,35 +136,29 @@ class Orders:
 
 @dataclass
 class Scenario:
-    """Three jumps of the target with one knock in between, a drift, and a standing target at the end.
+    """What happens to target and object, phase by phase.
 
-    A jump ends as soon as the box has been within 10 mm of the target for one second, or at its timeout.
+    A phase ends as soon as the object has been at the target for a while, or at its timeout; a drift lasts
+    until then.
 
     Attributes:
-        rng: chooses the targets and the knock.
-        duration: the longest the scenario may take [s].
-        drift_time: how long the target drifts [s], but at most a fifth of the duration.
-        area: where targets are.
+        rng: chooses targets and knocks.
+        phases: in order.
+        area: where targets are, and where knocks leave the object.
+        reached_distance: how near to the target counts as being there [m].
+        hold_time: for how long [s].
+        jump: how far from the object a target is at least that jumps somewhere [m].
     """
 
     rng: np.random.Generator
-    duration: float = 90.0
-    drift_time: float = 12.0
+    phases: list[Phase]
     area: Area = field(default_factory=Area)
+    reached_distance: float = REACHED_DISTANCE
+    hold_time: float = HOLD_TIME
+    jump: float = 0.15
 
     def __post_init__(self) -> None:
-        """Lay out the phases."""
-        drift = min(self.drift_time, 0.2 * self.duration)
-        jump = (self.duration - drift) / 5.0
-        limits = {
-            "target 1": jump,
-            "target 2": jump,
-            "knock": jump,
-            "target 3": jump,
-            "drift": drift,
-            "rest": jump,
-        }
-        self.phases = [Phase(name, timeout) for name, timeout in limits.items()]
+        """Nothing has begun."""
         self.index = -1
         self.drift_distances: list[float] = []
         self._goal = np.zeros(2)
@@ -178,66 +182,67 @@ class Scenario:
         """Share of the phases that are over, between 0 and 1."""
         return max(self.index, 0) / len(self.phases)
 
-    def step(self, now: float, box: NDArray[np.float64], tool: NDArray[np.float64]) -> Orders:
+    def step(self, now: float, box: NDArray[np.float64], tools: NDArray[np.float64]) -> Orders:
         """Advance to a time.
 
         Args:
             now: simulated time [s], never going back.
-            box: position of the box (2,) [m].
-            tool: position of the pushing tool (2,) [m]; the hand shoves the box away from it.
+            box: position of the object (2,) [m].
+            tools: positions of the pushing tools (E, 2) [m]; the hand shoves the object away from them.
 
         Returns:
             What to command now.
         """
         if self.index < 0:
-            self._enter(0, now, box, tool)
+            self._enter(0, now, box, tools)
         elapsed = now - self._now if math.isfinite(self._now) else 0.0
         self._now = now
-        name = self.phase.name
-        if name == "drift":
+        drifting = self.phase.begins == "drift"
+        if drifting:
             self._drift(elapsed)
             self.drift_distances.append(float(np.linalg.norm(box - self._goal)))
-        force = (
-            self._knock.force(now, box) if name == "knock" and self._knock and not self._knock.done else None
-        )
+        force = None if self._knock is None or self._knock.done else self._knock.force(now, box)
         self._watch(now, box, busy=force is not None)
         if not self.finished and self._over(now):
-            self._enter(self.index + 1, now, box, tool)
-        return Orders(self._goal.copy(), name == "drift", force)
+            self._enter(self.index + 1, now, box, tools)
+        return Orders(self._goal.copy(), drifting, force)
 
     def _watch(self, now: float, box: NDArray[np.float64], *, busy: bool) -> None:
-        """Note since when the box has been at the target."""
-        if busy or np.linalg.norm(box - self._goal) > REACHED_DISTANCE:
+        """Note since when the object has been at the target."""
+        if busy or np.linalg.norm(box - self._goal) > self.reached_distance:
             self._inside_since = math.nan
         elif math.isnan(self._inside_since):
             self._inside_since = now
         phase = self.phase
-        if now - self._inside_since >= HOLD_TIME and math.isnan(phase.reached):
+        if now - self._inside_since >= self.hold_time and math.isnan(phase.reached):
             phase.reached = self._inside_since
 
     def _over(self, now: float) -> bool:
         phase = self.phase
         timed_out = now - phase.start >= phase.timeout
-        return timed_out or (phase.name != "drift" and math.isfinite(phase.reached))
+        return timed_out or (phase.judged and math.isfinite(phase.reached))
 
-    def _enter(self, index: int, now: float, box: NDArray[np.float64], tool: NDArray[np.float64]) -> None:
+    def _enter(self, index: int, now: float, box: NDArray[np.float64], tools: NDArray[np.float64]) -> None:
         if index > 0:
             self.phases[index - 1].end = now
         self.index = index
-        self._inside_since = math.nan
+        self._inside_since, self._knock = math.nan, None
         if self.finished:
             return
-        self.phase.start = now
-        if self.phase.name.startswith("target"):
-            self._goal = self.area.sample(self.rng, box, distance=0.15)
-        elif self.phase.name == "knock":
-            self._knock = self._aim(box, tool)
-        elif self.phase.name == "drift":
+        phase = self.phase
+        phase.start = now
+        if phase.begins == "jump":
+            goal = phase.goal
+            self._goal = self.area.sample(self.rng, box, self.jump) if goal is None else goal
+        elif phase.begins == "knock":
+            self._knock = self._aim(box, tools)
+        elif phase.begins == "drift":
             self._drift_direction = -1.0 if self._goal[1] > 0.0 else 1.0
 
-    def _aim(self, box: NDArray[np.float64], tool: NDArray[np.float64]) -> Knock:
-        """A shove of 5 to 10 cm, away from the tool, that leaves the box among the targets."""
-        away = math.atan2(box[1] - tool[1], box[0] - tool[0])
+    def _aim(self, box: NDArray[np.float64], tools: NDArray[np.float64]) -> Knock:
+        """A shove of 6 to 9 cm, away from the tools, that leaves the object among the targets."""
+        behind = np.reshape(tools, (-1, 2)).mean(axis=0)
+        away = math.atan2(box[1] - behind[1], box[0] - behind[0])
         for spread in np.linspace(0.3, math.pi, 200):
             angle, distance = away + self.rng.uniform(-spread, spread), self.rng.uniform(0.06, 0.09)
             direction = np.array([math.cos(angle), math.sin(angle)])

@@ -13,7 +13,8 @@ import yaml
 from sim_bridge.franka_driver import FrankaDriverConfig
 from sim_bridge.scene import Scene
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.mpc_planner import MpcPlannerConfig
+from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.robot.tool_plane import ToolPlane
 
 HAND_HOLD = 0.04
 """How long the hand presses on when nothing more is heard of it [s]: two of its periods."""
@@ -55,6 +56,11 @@ class Settings:
     def scene(self) -> Scene:
         """The cell as the driver builds it."""
         return self.driver.simulation().scene
+
+    @property
+    def tools(self) -> ToolPlane:
+        """The plane of the tools of the robot that is simulated."""
+        return self.driver.scene.plane()
 
     @property
     def planner_rate(self) -> float:

@@ -13,6 +13,7 @@ from sim_bridge.report.recording import Recording
 from vpsto_ros.trajectory.timing import Limits
 
 TARGET, BOX, TOOL, PLAIN = "#2a9d4a", "#d97706", "#0f6e84", "#6b7280"
+TOOLS = (TOOL, "#9d4edd")
 
 
 def figure(width: float = 9.0, height: float = 3.6) -> tuple[Any, Any]:
@@ -26,14 +27,19 @@ def figure(width: float = 9.0, height: float = 3.6) -> tuple[Any, Any]:
     return canvas, axes
 
 
-def distance_chart(path: Path, recording: Recording, phases: Sequence[dict[str, Any]]) -> None:
+def distance_chart(
+    path: Path, recording: Recording, phases: Sequence[dict[str, Any]], reached: float
+) -> None:
     """How far the object is from the target over time, with the scenario's phases marked."""
     canvas, axes = figure()
     time, distance = recording.distance()
     start = _start(recording)
     axes.semilogy(time - start, np.maximum(distance, 3e-4) * 1e3, color=BOX, lw=1.4)
-    axes.axhline(10.0, color=TARGET, lw=1.0, ls="--")
-    axes.annotate("reached: 10 mm", (0.0, 10.0), (3, 3), textcoords="offset points", color=TARGET, fontsize=8)
+    near = 1e3 * reached
+    axes.axhline(near, color=TARGET, lw=1.0, ls="--")
+    axes.annotate(
+        f"reached: {near:.0f} mm", (0.0, near), (3, 3), textcoords="offset points", color=TARGET, fontsize=8
+    )
     for phase in phases:
         begin = phase["start_s"]
         axes.axvline(begin - start, color=PLAIN, lw=0.7)
@@ -50,19 +56,26 @@ def distance_chart(path: Path, recording: Recording, phases: Sequence[dict[str, 
 
 
 def top_view(
-    path: Path, recording: Recording, tool: NDArray[np.float64], corners: Sequence[NDArray[np.float64]]
+    path: Path,
+    recording: Recording,
+    tips: NDArray[np.float64],
+    corners: Sequence[NDArray[np.float64]],
+    bases: NDArray[np.float64],
 ) -> None:
-    """Paths of object, target and tool on the table, seen from above.
+    """Paths of object, target and tools on the table, seen from above.
 
     Args:
         path: file to write.
         recording: the run.
-        tool: tool positions (K, 2) at the times of the joint states [m].
+        tips: positions (K, tools, 3) at the times of the joint states [m].
         corners: polygons (P, 2) of the object in its own frame [m].
+        bases: where the arms stand, shape (arms, 3) [m].
     """
     canvas, axes = figure(7.0, 6.5)
     pose, goal = recording.object.pose, recording.goal.pose
-    axes.plot(tool[:, 1], tool[:, 0], color=TOOL, lw=0.7, alpha=0.6, label="tool")
+    names = ("tool",) if tips.shape[1] == 1 else ("left tool", "right tool")
+    for tool, (name, colour) in enumerate(zip(names, TOOLS, strict=False)):
+        axes.plot(tips[:, tool, 1], tips[:, tool, 0], color=colour, lw=0.7, alpha=0.6, label=name)
     axes.plot(pose[:, 1], pose[:, 0], color=BOX, lw=1.6, label="object")
     axes.plot(goal[:, 1], goal[:, 0], ".", color=TARGET, ms=2.5)
     stops = (
@@ -72,10 +85,10 @@ def top_view(
     for index, alpha in ((0, 0.35), (-1, 1.0)):
         if len(pose):
             _outline(axes, pose[index], corners, alpha)
-    axes.plot(0.0, 0.0, "s", color=PLAIN, ms=9, label="robot base")
+    axes.plot(bases[:, 1], bases[:, 0], "s", color=PLAIN, ms=9, ls="none", label="robot base")
     axes.set(xlabel="y [m]", ylabel="x [m]", aspect="equal")
     axes.invert_xaxis()
-    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    axes.legend(loc="lower center", fontsize=8, frameon=False)
     canvas.savefig(path)
 
 
@@ -90,7 +103,7 @@ def _outline(
 
 
 def joint_chart(path: Path, recording: Recording, limits: Limits, torque_limits: NDArray[np.float64]) -> None:
-    """Velocity and torque of every joint as shares of their limits."""
+    """Velocity and torque of every joint as shares of their limits; a second arm is dashed."""
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=(9.0, 4.6), dpi=130, layout="constrained")
@@ -100,15 +113,18 @@ def joint_chart(path: Path, recording: Recording, limits: Limits, torque_limits:
         (upper, joints.velocity, limits.velocity, "velocity"),
         (lower, joints.effort, torque_limits, "torque"),
     ):
-        axes.plot(joints.time - start, 100.0 * values / allowed, lw=0.8)
+        for joint, share in enumerate((100.0 * values / allowed).T):
+            style = "-" if joint < 7 else "--"
+            axes.plot(joints.time - start, share, style, color=f"C{joint % 7}", lw=0.8)
         for bound in (-100.0, 100.0):
             axes.axhline(bound, color=PLAIN, lw=1.0, ls="--")
         axes.set(ylabel=f"{name} [% of limit]", ylim=(-110, 110))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25)
-    upper.legend(
-        [f"joint {i + 1}" for i in range(joints.position.shape[1])], ncols=7, fontsize=7, frameon=False
-    )
+    count = joints.position.shape[1]
+    arms = ("",) if count <= 7 else ("left ", "right ")
+    names = [f"{arms[i // 7]}joint {i % 7 + 1}" for i in range(count)]
+    upper.legend(names, ncols=7, fontsize=7 if count <= 7 else 5.5, frameon=False)
     lower.set_xlabel("time [s]")
     canvas.savefig(path)
 

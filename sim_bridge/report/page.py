@@ -58,17 +58,16 @@ def write_page(
 
 def demo_tables(summary: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]:
     """The tables of a demo's report from its summary."""
-    mpc, drift = summary["mpc"], summary["drift"]
+    mpc = summary["mpc"]
     compute = mpc["compute_ms"]
     figures = [
         ["figure", "value"],
         ["final distance to the target", number(summary["final_error_m"], 1e3, "mm", 1)],
-        [
-            "median distance while the target drifts at 2 cm/s",
-            number(drift["median_distance_m"], 1e3, "mm", 1),
-        ],
+        *_drift_row(summary),
         ["limit violations", str(summary["limit_violations"])],
-        ["largest deviation of the tool's height", number(summary["tool_height_deviation_m"], 1e3, "mm", 2)],
+        *_contact_row(summary),
+        ["trajectories that the controller refused", _count(summary["refused_trajectories"])],
+        ["largest deviation of a tool's height", number(summary["tool_height_deviation_m"], 1e3, "mm", 2)],
         ["plans per simulated second", number(mpc["rate_hz"], 1.0, "Hz", 1)],
         [
             "compute time p50 / p99 / max",
@@ -84,9 +83,27 @@ def demo_tables(summary: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]
     phases = [["phase", "began at", "time to reach"]]
     begin = summary["phases"][0]["start_s"]
     for phase in summary["phases"]:
-        reach = "–" if phase["name"] == "drift" else number(phase["time_to_reach_s"], 1.0, "s", 1)
+        reach = number(phase["time_to_reach_s"], 1.0, "s", 1) if phase["judged"] else "–"
         phases.append([phase["name"], number(phase["start_s"] - begin, 1.0, "s", 1), reach])
     return [("What was measured", figures), ("What happened", phases)]
+
+
+def _drift_row(summary: Mapping[str, Any]) -> list[list[str]]:
+    if "drift" not in summary:
+        return []
+    median = number(summary["drift"]["median_distance_m"], 1e3, "mm", 1)
+    return [["median distance while the target drifts at 2 cm/s", median]]
+
+
+def _contact_row(summary: Mapping[str, Any]) -> list[list[str]]:
+    contacts = summary["contacts"] or {}
+    names = {"arms": "arms", "table": "table", "object": "object, not by a tool"}
+    shown = [f"{names.get(kind, kind)}: {steps} ms" for kind, steps in contacts.items()]
+    return [["what arms touched that they should not", ", ".join(shown) or "unknown"]]
+
+
+def _count(value: int | None) -> str:
+    return "unknown" if value is None else str(value)
 
 
 def number(value: float, scale: float, unit: str, digits: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.report.bag import read_messages
+from sim_bridge.report.overlay import MARKERS, Overlay, overlays_of
 
 FloatArray = NDArray[np.float64]
 
@@ -21,6 +23,8 @@ GROUND_TRUTH = "/franka_driver/ground_truth/object"
 GOAL_POSE = "/goal_pose"
 OBJECT_STATE = "/object_state"
 DIAGNOSTICS = "/diagnostics"
+STALE_DRAWING = 1.0
+"""What a node drew is shown no longer [s]; it draws several times a second."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,14 @@ class Status:
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """What a node drew from a time on [s]."""
+
+    time: float
+    overlays: tuple[Overlay, ...]
+
+
+@dataclass(frozen=True)
 class Recording:
     """Everything about a run that figures, replay and summary are made from."""
 
@@ -103,14 +115,29 @@ class Recording:
     estimate: PoseSeries
     commands: list[Command] = field(default_factory=list)
     diagnostics: dict[str, list[Status]] = field(default_factory=dict)
+    drawn: dict[str, list[Drawing]] = field(default_factory=dict)
 
     @classmethod
-    def from_bag(cls, folder: Path) -> Recording:
-        """Read a bag written by the demo."""
-        reader = _Reader()
+    def from_bag(cls, folder: Path, height: float = 0.0) -> Recording:
+        """Read a bag written by the demo.
+
+        Args:
+            folder: of the bag.
+            height: of the object, above which its belief is drawn [m].
+        """
+        reader = _Reader(height)
         for topic, seconds, message in read_messages(folder, reader.handlers):
             reader.handlers[topic](seconds, message)
         return reader.recording()
+
+    def overlays(self, time: float) -> tuple[Overlay, ...]:
+        """What all nodes had drawn at a time [s]."""
+        found: list[Overlay] = []
+        for drawings in self.drawn.values():
+            index = bisect.bisect_right(drawings, time, key=lambda drawing: drawing.time) - 1
+            if index >= 0 and time - drawings[index].time < STALE_DRAWING:
+                found += drawings[index].overlays
+        return tuple(found)
 
     def distance(self) -> tuple[FloatArray, FloatArray]:
         """Times (K,) [s] since there is a target, and the object's distances from it (K,) [m]."""
@@ -130,7 +157,9 @@ class Recording:
 class _Reader:
     """Collects messages by topic."""
 
-    def __init__(self) -> None:
+    def __init__(self, height: float) -> None:
+        self._height = height
+        self.drawn: dict[str, list[Drawing]] = {}
         self.joints: list[tuple[float, Any]] = []
         self.poses: dict[str, list[tuple[float, float, float, float]]] = {}
         self.commands: list[Command] = []
@@ -142,6 +171,7 @@ class _Reader:
             OBJECT_STATE: self._odometry(OBJECT_STATE),
             GOAL_POSE: self._goal,
             DIAGNOSTICS: self._diagnostic,
+            **{topic: self._drawing(topic) for topic in MARKERS},
         }
 
     def recording(self) -> Recording:
@@ -158,6 +188,7 @@ class _Reader:
             self._series(OBJECT_STATE),
             self.commands,
             self.diagnostics,
+            self.drawn,
         )
 
     def _series(self, topic: str) -> PoseSeries:
@@ -185,6 +216,13 @@ class _Reader:
         time = np.array([start + p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points])
         parts = [_stacked(points, name) for name in ("velocities", "accelerations")]
         self.commands.append(Command(seconds, time, np.array([p.positions for p in points]), *parts))
+
+    def _drawing(self, topic: str) -> Callable[[float, Any], None]:
+        def receive(seconds: float, message: Any) -> None:
+            overlays = overlays_of(message.markers, MARKERS[topic], self._height)
+            self.drawn.setdefault(topic, []).append(Drawing(seconds, overlays))
+
+        return receive
 
     def _diagnostic(self, seconds: float, message: Any) -> None:
         # By the time of the report: a recorder on a busy machine may read it late.

@@ -11,7 +11,8 @@ import numpy as np
 
 from sim_bridge.demo.scenario import DRIFT_MEDIAN_DISTANCE, DRIFT_SPEED, Scenario
 from sim_bridge.report.recording import Command, JointSeries, Recording, Status
-from vpsto_ros.robot.kinematics import Robot, forward_kinematics_batch
+from vpsto_ros.robot.kinematics import Robot
+from vpsto_ros.robot.tool_plane import ToolPlane
 from vpsto_ros.trajectory import Limits, Trajectory
 
 DRIVER, PLANNER = "franka_driver", "mpc_planner"
@@ -31,7 +32,6 @@ class RunFacts:
         first_plan: from the start of the processes to the first plan [s].
         elapsed: wall time while the scenario ran [s].
         trouble: processes that ended early or badly, in words.
-        tool_height: nominal height of the tool's tip above the table [m].
         planner_rate: the configured planning rate [Hz].
     """
 
@@ -39,15 +39,24 @@ class RunFacts:
     first_plan: float
     elapsed: float
     trouble: Sequence[str]
-    tool_height: float
     planner_rate: float
 
 
-def summarize(recording: Recording, scenario: Scenario, robot: Robot, facts: RunFacts) -> dict[str, Any]:
-    """Everything that ``summary.json`` holds; ``success`` and ``failures`` are the verdict."""
+def summarize(
+    recording: Recording, scenario: Scenario, tools: ToolPlane, facts: RunFacts, *, strict: bool = False
+) -> dict[str, Any]:
+    """Everything that ``summary.json`` holds; ``success`` and ``failures`` are the verdict.
+
+    Args:
+        recording: the run.
+        scenario: as it went.
+        tools: the plane in which the robot's tools should have stayed.
+        facts: what the recording cannot tell.
+        strict: whether contacts of the arms and refused trajectories are failures as well.
+    """
     _, distance = recording.distance()
-    limits = limit_violations(recording, robot)
-    heights = forward_kinematics_batch(recording.joints.position)[:, 2]
+    limits = limit_violations(recording, tools.robot)
+    heights = tools.tool_heights(recording.joints.position)
     start, end = scenario.phases[0].start, scenario.phases[-1].end
     if not math.isfinite(end):
         end = recording.object.time[-1]
@@ -59,19 +68,17 @@ def summarize(recording: Recording, scenario: Scenario, robot: Robot, facts: Run
         "limit_violations_by_kind": limits,
         "mpc": planner_figures(recording, start, end, facts.planner_rate),
         "time_to_first_plan_s": facts.first_plan,
-        "tool_height_deviation_m": float(np.abs(heights - facts.tool_height).max()),
+        "tool_height_deviation_m": float(np.abs(heights - tools.height).max()),
+        "reached_distance_m": scenario.reached_distance,
         "phases": [_phase_figures(phase) for phase in scenario.phases],
-        "drift": {
-            "speed_m_s": DRIFT_SPEED,
-            "median_distance_m": float(np.median(scenario.drift_distances))
-            if scenario.drift_distances
-            else math.nan,
-        },
+        **_drift_figures(scenario),
+        **driver_counts(recording.diagnostics.get(DRIVER, []), start),
         "seed": facts.seed,
         "simulated_s": float(end - start),
         "real_time_factor": float((end - start) / facts.elapsed) if facts.elapsed > 0.0 else math.nan,
     }
-    summary["failures"] = [*failures(summary), *facts.trouble]
+    found = failures(summary) + (strict_failures(summary) if strict else [])
+    summary["failures"] = [*found, *facts.trouble]
     summary["success"] = not summary["failures"]
     return summary
 
@@ -183,16 +190,14 @@ def planner_failures(mpc: Mapping[str, Any]) -> list[str]:
 def failures(summary: Mapping[str, Any]) -> list[str]:
     """What keeps a run from being a success, in words; empty when nothing does."""
     found = []
+    near = f"within {summary['reached_distance_m'] * 1e3:.0f} mm for one second"
     for phase in summary["phases"]:
-        if phase["name"] != "drift" and not math.isfinite(phase["time_to_reach_s"]):
-            found.append(
-                f"{phase['name']}: the box was not at the target (within 10 mm for one second) in time"
-            )
-    drift = summary["drift"]["median_distance_m"]
-    if not drift <= DRIFT_MEDIAN_DISTANCE:
-        found.append(
-            f"drift: median distance {drift * 1e3:.0f} mm, allowed are {DRIFT_MEDIAN_DISTANCE * 1e3:.0f} mm"
-        )
+        if phase["judged"] and not math.isfinite(phase["time_to_reach_s"]):
+            found.append(f"{phase['name']}: the object was not at the target ({near}) in time")
+    if "drift" in summary:
+        drift, most = summary["drift"]["median_distance_m"], DRIFT_MEDIAN_DISTANCE
+        if not drift <= most:
+            found.append(f"drift: median distance {drift * 1e3:.0f} mm, allowed are {most * 1e3:.0f} mm")
     if summary["limit_violations"]:
         kinds = [kind for kind, count in summary["limit_violations_by_kind"].items() if count]
         found.append(f"{summary['limit_violations']} limit violations ({', '.join(kinds)})")
@@ -205,9 +210,56 @@ def failures(summary: Mapping[str, Any]) -> list[str]:
     return found
 
 
+def driver_counts(statuses: Sequence[Status], start: float) -> dict[str, Any]:
+    """What the driver counted from a time [s] on: contacts that should not be, and what it refused.
+
+    Contacts are steps of 1 ms by kind: "arms" (two arms, or an arm and itself), "table", "object" (an arm
+    other than by its tool). Without any report of the driver, there is nothing of all this.
+    """
+    if not statuses:
+        return {"contacts": None, "refused_trajectories": None}
+    before, last = [status for status in statuses if status.time <= start], statuses[-1]
+
+    def since(key: str) -> int:
+        return int(last.number(key) - (before[-1].number(key) if before and key in before[-1].values else 0))
+
+    kinds = [key.split(".")[1] for key in last.values if key.startswith("contact.")]
+    refused = [key for key in last.values if key.startswith("rejected.joint_trajectory")]
+    return {
+        "contacts": {kind: since(f"contact.{kind}.steps") for kind in kinds},
+        "refused_trajectories": sum(since(key) for key in refused),
+    }
+
+
+def strict_failures(summary: Mapping[str, Any]) -> list[str]:
+    """Contacts that should not have been, and plans that the controller could not take, in words."""
+    contacts, refused = summary["contacts"], summary["refused_trajectories"]
+    if not contacts or "arms" not in contacts:
+        return ["the driver did not say what the arms touched"]
+    what = {"arms": "the arms touched each other", "table": "an arm touched the table"}
+    found = [
+        f"{what.get(kind, 'an arm touched the object other than by its tool')} for {steps} ms"
+        for kind, steps in contacts.items()
+        if steps
+    ]
+    if refused:
+        found.append(f"the controller refused {refused} trajectories")
+    return found
+
+
+def _drift_figures(scenario: Scenario) -> dict[str, Any]:
+    """How near the object stayed to a drifting target, if the scenario has one."""
+    if all(phase.judged for phase in scenario.phases):
+        return {}
+    distances = scenario.drift_distances
+    median = float(np.median(distances)) if distances else math.nan
+    return {"drift": {"speed_m_s": DRIFT_SPEED, "median_distance_m": median}}
+
+
 def _phase_figures(phase: Any) -> dict[str, Any]:
     return {
         "name": phase.name,
+        "judged": phase.judged,
         "start_s": phase.start,
         "end_s": phase.end,
         "time_to_reach_s": phase.time_to_reach,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import concurrent.futures
-import itertools
 import multiprocessing
 import os
 from collections.abc import Sequence
@@ -13,6 +12,8 @@ from typing import Any
 from sim_bridge.report.view import Frame, ModelState
 
 WIDTH, HEIGHT = 960, 540
+LINE_WIDTH = 3.0
+"""Of what the nodes draw [pixels]."""
 REMEDY = "apt install libegl1 libgl1 (or libosmesa6, and set MUJOCO_GL=osmesa)"
 
 
@@ -82,23 +83,26 @@ def _render(
             # Cameras and lights are not part of mj_kinematics.
             mujoco.mj_camlight(model, state.data)
             renderer.update_scene(state.data, camera)
-            _draw_plan(renderer.scene, frame)
+            _draw_overlays(renderer.scene, frame)
             writer.append_data(renderer.render())
 
 
-def _draw_plan(scene: Any, frame: Frame) -> None:
-    """The planned tool path as a line of thin capsules just above the table."""
+def _draw_overlays(scene: Any, frame: Frame) -> None:
+    """Lines, which are cheap to draw, and small spheres."""
     import mujoco
     import numpy as np
 
-    if frame.plan is None:
-        return
-    points = np.column_stack((frame.plan, np.full(len(frame.plan), 0.012)))[:: max(1, len(frame.plan) // 24)]
-    for begin, end in itertools.pairwise(points):
-        if scene.ngeom >= scene.maxgeom:
-            return
-        geom = scene.geoms[scene.ngeom]
-        rgba = np.array([0.06, 0.43, 0.52, 1.0], dtype=np.float32)
-        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
-        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.003, begin, end)
-        scene.ngeom += 1
+    still, level = np.zeros(3), np.eye(3).ravel()
+    for overlay in frame.overlays:
+        rgba = np.array([*overlay.colour, 1.0], dtype=np.float32)
+        size = np.full(3, 0.5 * overlay.width)
+        for item in overlay.points:
+            if scene.ngeom >= scene.maxgeom:
+                return
+            geom = scene.geoms[scene.ngeom]
+            if overlay.lines:
+                mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LINE, still, still, level, rgba)
+                mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_LINE, LINE_WIDTH, *item)
+            else:
+                mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, item, level, rgba)
+            scene.ngeom += 1

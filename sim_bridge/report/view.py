@@ -13,11 +13,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.report.overlay import Overlay
+
 FloatArray = NDArray[np.float64]
 
-PLAN_POINTS = 24
-PLAN_HEIGHT = 0.012
-PLAN_COLOR = (15, 110, 132)
 # Geometry groups that are drawn; the higher ones hold what only collides.
 VISIBLE_GROUPS = range(3)
 BACKGROUND = "/background"
@@ -31,13 +30,13 @@ class Frame:
         joints: joint positions (n,) [rad].
         object_pose: x, y [m] and yaw [rad] of the object, (3,); None leaves it where it is.
         target: x, y [m] of the target (2,), hidden when None or not finite.
-        plan: points of the planned tool path (P, 2) [m], hidden when None.
+        overlays: what the nodes draw.
     """
 
     joints: FloatArray
     object_pose: FloatArray | None = None
     target: FloatArray | None = None
-    plan: FloatArray | None = None
+    overlays: tuple[Overlay, ...] = ()
 
 
 class ModelState:
@@ -90,10 +89,8 @@ class CellView:
         camera.fov = math.radians(42.0)
         mujoco.mj_kinematics(model, self._state.data)
         self._bodies = {body: self._add_body(body) for body in range(model.nbody)}
-        self._plan = scene.add_line_segments(
-            "/plan", np.zeros((PLAN_POINTS - 1, 2, 3)), PLAN_COLOR, thickness=0.006, visible=False
-        )
-        self._drawn_plan: FloatArray | None = None
+        self._overlays: dict[str, Any] = {}
+        self._drawn: dict[str, Overlay] = {}
 
     def _add_body(self, body: int) -> Any:
         """A frame with one mesh per colour below it."""
@@ -116,20 +113,30 @@ class CellView:
         with self._server.atomic():
             for body, handle in self._bodies.items():
                 _move(handle, data.xpos[body], data.xquat[body])
-            self._show_plan(frame.plan)
+            self._show_overlays({overlay.name: overlay for overlay in frame.overlays})
 
-    def _show_plan(self, plan: FloatArray | None) -> None:
-        if plan is self._drawn_plan:
-            return
-        self._drawn_plan = plan
-        if plan is not None and len(plan) > 1:
-            index = np.linspace(0, len(plan) - 1, PLAN_POINTS)
-            columns = [np.interp(index, np.arange(len(plan)), plan[:, axis]) for axis in (0, 1)]
-            points = np.stack((*columns, np.full(PLAN_POINTS, PLAN_HEIGHT)), axis=-1)
-            self._plan.points = np.stack((points[:-1], points[1:]), axis=1)
-        visible = plan is not None and len(plan) > 1
-        if self._plan.visible != visible:
-            self._plan.visible = visible
+    def _show_overlays(self, wanted: dict[str, Overlay]) -> None:
+        """Draw what is new, hide what is gone; what stays the same is not sent again."""
+        for name in self._overlays:
+            if (name in wanted) != self._overlays[name].visible:
+                self._overlays[name].visible = name in wanted
+        for name, overlay in wanted.items():
+            if overlay is self._drawn.get(name):
+                continue
+            self._drawn[name] = overlay
+            if name in self._overlays:
+                self._overlays[name].points = overlay.points
+            else:
+                self._overlays[name] = self._add_overlay(overlay)
+
+    def _add_overlay(self, overlay: Overlay) -> Any:
+        scene, path = self._server.scene, f"/overlay/{overlay.name}"
+        colour = tuple(round(255 * value) for value in overlay.colour)
+        if overlay.lines:
+            return scene.add_line_segments(path, overlay.points, colour, thickness=overlay.width)
+        return scene.add_point_cloud(
+            path, overlay.points, colour, point_size=overlay.width, point_shape="circle", precision="float32"
+        )
 
 
 def open_server(port: int = 0) -> Any:
