@@ -54,12 +54,15 @@ def arm_points(q: NDArray) -> NDArray[np.float64]:
     return np.array(points)
 
 
+def arm_bases(tools: ToolPlane) -> NDArray[np.float64]:
+    """Where the arms of a robot stand, shape (arms, 3) [m]."""
+    return BALL_BASES if tools.robot.dof == 14 else np.zeros((1, 3))
+
+
 def arm_lines(tools: ToolPlane, q: NDArray) -> list[NDArray[np.float64]]:
     """Each arm of a robot as a polyline (P, 3) [m], from its base by a crank, if it has one, to the tip."""
-    tips = tools.tips(q)
-    bases = BALL_BASES if len(tips) == 2 else np.zeros((1, 3))
-    lines = []
-    for base, joints, tip in zip(bases, np.split(np.asarray(q), len(tips)), tips, strict=True):
+    tips, lines = tools.tips(q), []
+    for base, joints, tip in zip(arm_bases(tools), np.split(np.asarray(q), len(tips)), tips, strict=True):
         points = base + arm_points(joints)
         flange, axis = points[-2], (points[-1] - points[-2]) / TOOL_LENGTH
         corner = tip - axis * (axis @ (tip - flange))
