@@ -17,11 +17,15 @@ from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from sim_bridge.experiments.pushing.loop import push_box_loop
 from sim_bridge.scene import Scene
 from sim_bridge.simulation import Simulation
+from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.collision.arm import ArmCollision
 from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.planar_discs import MovingDisc
+from vpsto_ros.contact.end_effectors import EndEffectors
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.contact.pushing import PushingModel, push_directions
+from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
+from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
@@ -32,13 +36,14 @@ from vpsto_ros.trajectory.key_timing import time_key_positions
 
 
 def run(_arguments: argparse.Namespace | None = None) -> int:
-    """Push a box, evaluate trajectories, plan among obstacles.
+    """Push a box, track a can, evaluate trajectories, plan among obstacles.
 
     Returns:
         0.
     """
     began = time.perf_counter()
-    for use in (push_a_box, move_two_arms, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
+    pushing = push_a_box, move_two_arms, track_a_pushed_can
+    for use in (*pushing, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
     return 0
@@ -56,6 +61,19 @@ def move_two_arms() -> None:
     simulation = Simulation(Scene(robot="two_balls"))
     simulation.advance(0.01)
     simulation.tool_velocity()
+
+
+def track_a_pushed_can() -> None:
+    """Particles that are pushed, seen and felt."""
+    for shape in (PlanarShape.disc(0.05), PlanarShape.box(0.1, 0.1)):
+        dynamics = BeliefDynamics(shape, EndEffectors.discs(0.03, 2), friction=True, way_variance=1e-5)
+        tracker = ObjectParticleFilter(ParticleFilterConfig(), dynamics, np.random.default_rng(0))
+        for step in range(5):
+            x = 0.42 + 0.002 * step
+            tracker.predict(0.01 * step, [x, 0.04, x, -0.04])
+            tracker.update(0.01 * step, np.array([0.5, 0.0, 0.0]), 1e-6 * np.eye(3))
+            tracker.touch(0.01 * step, np.array([-2.0, 0.0]), 0.1)
+        tracker.state(0.05)
 
 
 def evaluate_a_trajectory() -> None:

@@ -408,6 +408,7 @@ def test_likelihoods_of_a_touch_are_densities():
         (0.1, [0.5, 0.0, 0.0], CAMERA + np.triu(np.full((3, 3), 1e-5), 1), "symmetric"),
         (0.1, [0.5, 2.0, 0.0], CAMERA, "outside the table"),
         (0.3, [0.5, 0.0, 0.0], CAMERA, "ahead"),
+        (0.1, [0.5, 0.0, 0.0], 1e200 * CAMERA, "tells nothing"),
     ],
 )
 def test_a_bad_pose_is_refused_with_a_reason_and_changes_nothing(stamp, pose, covariance, reason):
@@ -461,6 +462,9 @@ def test_a_gap_of_plane_points_does_not_sweep_the_object_away():
     outcome = tracker.predict(2.0, [0.7, 0.0])  # it went round
     assert outcome == "accepted" and "unknown" in outcome.reason
     np.testing.assert_allclose(tracker.state(2.0).pose[:2], [0.5, 0.0], atol=6e-3)
+    # Nor does a posture that jumps.
+    assert "unknown" in tracker.predict(2.01, [0.3, 0.0]).reason
+    np.testing.assert_allclose(tracker.state(2.01).pose[:2], [0.5, 0.0], atol=6e-3)
     # Where the end effector is now the object is not.
     tracker.predict(4.0, [0.5, 0.01])
     gaps = particle_contacts(tracker.dynamics, tracker.belief(4.0).poses, [0.5, 0.01], np.zeros(2)).gaps

@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.belief.particles import ObjectBelief
 from vpsto_ros.estimation import touch as touching
-from vpsto_ros.estimation.contact_queries import particle_contacts
 from vpsto_ros.estimation.measurement import Outcome, PoseMeasurement, checked, could_follow, finite_array
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.particle_cloud import ParticleCloud, object_state, pose_moments, systematic
@@ -73,7 +72,8 @@ class ObjectParticleFilter:
             plane_point: plane coordinates, shape (m,).
 
         Returns:
-            "accepted", "stale" (not later) or "invalid: reason".
+            "accepted", "stale" (not later; after a clock was set back, until :meth:`reset`) or "invalid:
+            reason".
         """
         point, defect = finite_array(plane_point, (self.dynamics.effectors.dof,))
         when, wrong = finite_array(time, ())
@@ -86,14 +86,16 @@ class ObjectParticleFilter:
         gap = now - cloud.head.time
         if gap <= 0.0:
             return Outcome("stale", f"time goes back by {-gap:.4g} s")
-        known = gap <= self.config.longest_gap
+        jump = float(np.abs(point - cloud.head.point).max())
+        known = gap <= self.config.longest_gap and jump <= self.config.longest_jump
         before = cloud.head.point if known else point
         poses = cloud.head.poses
         if cloud.begun:
             path = self._motion.refined(before, point)
             poses = self._motion.drawn(cloud, poses, gap, path, self._rng)
         cloud.push(now, point, poses)
-        return Outcome("accepted", "" if known else f"after a gap of {gap:.2g} s the way is unknown")
+        reason = f"the way is unknown after a gap of {gap:.2g} s and {jump:.2g} m or rad"
+        return Outcome("accepted", "" if known else reason)
 
     def update(self, stamp: float, pose: ArrayLike, covariance: ArrayLike) -> Outcome:
         """Take in a measured pose.
@@ -153,7 +155,12 @@ class ObjectParticleFilter:
         if felt == self._felt and stamp < self._touched + self.config.touch.interval:
             return Outcome("stale", "says the same as the one just used")
         self._touched, self._felt = float(stamp), felt
-        return self._feel(measured, float(stamp))
+        if not touching.weigh(
+            self._cloud, measured, float(stamp), self.config.touch, self.dynamics, self._rng
+        ):
+            return Outcome("outlier", "a force is felt where no particle is near")
+        self._settle()
+        return Outcome("accepted", "contact" if measured.felt.any() else "no contact")
 
     def belief(
         self, time: float, count: int | None = None, path: ArrayLike | None = None
@@ -170,8 +177,7 @@ class ObjectParticleFilter:
             InvalidInputError: the time is not finite, there are fewer than two particles, or the path is not
                 one.
         """
-        poses = self._poses(time, path)
-        cloud = self._cloud
+        poses, cloud = self._poses(time, path), self._cloud
         if poses is None:
             return None
         rows = systematic(cloud.weights, cloud.weights.size if count is None else count, 0.5)
@@ -205,9 +211,8 @@ class ObjectParticleFilter:
         if self._unconfirmed:
             reason = f"just started; {self._unconfirmed} more poses must agree"
             return FilterStatus("recovering", "; ".join(filter(None, (reason, trouble))))
-        return FilterStatus(
-            "tracking", trouble or (unseen(gap, spread) if gap > self.config.lost_after else "")
-        )
+        quiet = unseen(gap, spread) if gap > self.config.lost_after else ""
+        return FilterStatus("tracking", trouble or quiet)
 
     def _refusal(self, measurement: PoseMeasurement) -> Outcome | None:
         """Why a well-formed pose cannot be used, None if it can."""
@@ -218,9 +223,8 @@ class ObjectParticleFilter:
         elif measurement.stamp > cloud.head.time + config.max_ahead:
             ahead = measurement.stamp - cloud.head.time
             self._trouble = f"stamp is {ahead:.2g} s ahead of the last plane point"
-        elif not config.on_table(*measurement.pose[:2]):
-            x, y = measurement.pose[:2]
-            self._trouble = f"the object at ({x:.3f}, {y:.3f}) m is outside the table"
+        else:
+            self._trouble = config.objection(measurement.pose, measurement.covariance)
         if self._trouble:
             return Outcome("invalid", self._trouble)
         if measurement.stamp <= self._stamp:
@@ -265,32 +269,11 @@ class ObjectParticleFilter:
         ):
             self._pending.clear()
         self._pending.append(measurement)
-        if len(self._pending) < self.config.confirmations:
-            return Outcome("outlier", f"an outlier with probability {doubt:.3f}")
         count = len(self._pending)
+        if count < config.confirmations:
+            return Outcome("outlier", f"an outlier with probability {doubt:.3f}")
         self._restart(measurement)
         return Outcome("reinitialized", f"{count} consecutive poses contradict the belief and agree")
-
-    def _feel(self, measured: touching.Touch, stamp: float) -> Outcome:
-        cloud, config, dynamics = self._cloud, self.config.touch, self.dynamics
-        then, velocity = cloud.at(stamp), cloud.velocity(stamp)
-        contacts = particle_contacts(dynamics, then.poses, then.point, velocity)
-        if measured.felt.any():
-            moves, factors = touching.onto_manifold(
-                config, measured, dynamics, then.poses, cloud.weights, contacts, then.point, self._rng
-            )
-            weights = cloud.weights * factors
-            contacts = particle_contacts(dynamics, then.poses + moves, then.point, velocity)
-            near = weights @ (contacts.gaps.min(axis=1) < 2.0 * config.gap_scale)
-            if near < 1e-3 * weights.sum() * config.false_alarm:
-                return Outcome("outlier", "a force is felt where no particle is near")
-            cloud.shift(moves)
-            cloud.reweigh(factors)
-        unknown = np.full(len(cloud.weights), self.config.friction[1])
-        friction = cloud.friction if dynamics.friction else unknown
-        cloud.reweigh(touching.likelihoods(config, measured, contacts, friction))
-        self._settle()
-        return Outcome("accepted", "contact" if measured.felt.any() else "no contact")
 
     def _settle(self) -> None:
         """Draw particles anew if few of them matter, and keep them out of the end effectors."""

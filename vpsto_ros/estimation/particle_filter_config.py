@@ -3,9 +3,14 @@
 import dataclasses
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.touch import TouchConfig
 from vpsto_ros.exceptions import ConfigurationError
+
+_VAGUE = 1.0  # a position is measured better, or not at all [m]
 
 
 @documented
@@ -75,6 +80,13 @@ class ParticleFilterConfig:
         0.2, "gap between plane points beyond which the way in between is taken to be unknown", unit="s",
         minimum=0.01, maximum=10.0,
     )  # fmt: skip
+    longest_jump: float = option(
+        0.1,
+        "and likewise for the distance between two of them",
+        unit="m or rad",
+        minimum=1e-3,
+        maximum=10.0,
+    )
     longest_step: float = option(
         0.003, "plane points farther apart are interpolated", unit="m or rad", minimum=1e-4, maximum=0.1
     )
@@ -104,10 +116,14 @@ class ParticleFilterConfig:
             if low > high:
                 raise ConfigurationError(f"ParticleFilterConfig.{name} = {(low, high)} is not a range")
 
-    def on_table(self, x: float, y: float) -> bool:
-        """Whether a position is on the table."""
+    def objection(self, pose: NDArray, covariance: NDArray) -> str:
+        """Why an object cannot have been measured there, empty if it can."""
         (left, right), (front, back) = self.table_x, self.table_y
-        return left <= x <= right and front <= y <= back
+        x, y = pose[:2]
+        if not (left <= x <= right and front <= y <= back):
+            return f"the object at ({x:.3f}, {y:.3f}) m is outside the table"
+        vague = np.diag(covariance)[:2].max() > _VAGUE**2
+        return f"its standard deviation is above {_VAGUE} m: it tells nothing" if vague else ""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,8 +17,9 @@ from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.narrow_phase import COMPILED
 from vpsto_ros.estimation.contact_queries import ParticleContacts, particle_contacts
-from vpsto_ros.estimation.particle_cloud import pose_moments
+from vpsto_ros.estimation.particle_cloud import ParticleCloud, Snapshot, pose_moments
 
+_ANY_FRICTION = 0.5
 _ROUNDS = 6  # alternating projections onto the manifolds of two end effectors; each halves the distance
 
 
@@ -80,6 +81,44 @@ def read(config: TouchConfig, forces: NDArray, noise: float) -> Touch:
     """Decide which forces are felt."""
     least = max(config.threshold, config.threshold_sigmas * noise)
     return Touch(forces, noise, np.hypot(forces[:, 0], forces[:, 1]) > least)
+
+
+def weigh(
+    cloud: ParticleCloud,
+    touch: Touch,
+    stamp: float,
+    config: TouchConfig,
+    dynamics: BeliefDynamics,
+    rng: np.random.Generator,
+) -> bool:
+    """Weigh the particles by a touch, after a share of them was moved to where it can have happened.
+
+    Args:
+        cloud: the particles; where they were at the stamp counts.
+        touch: what was measured.
+        stamp: when [s].
+        config: how forces are read.
+        dynamics: shape of the object and end effectors; where that has no friction, cones are
+            nevertheless as wide as for a coefficient of 0.5.
+        rng: source of randomness.
+
+    Returns:
+        False if a force is felt where no particle can be; the cloud is then as it was.
+    """
+    then, velocity = cloud.at(stamp), cloud.velocity(stamp)
+    contacts = particle_contacts(dynamics, then.poses, then.point, velocity)
+    if touch.felt.any():
+        moves, factors = onto_manifold(config, touch, dynamics, then, cloud.weights, contacts, rng)
+        weights = cloud.weights * factors
+        contacts = particle_contacts(dynamics, then.poses + moves, then.point, velocity)
+        near = weights @ (contacts.gaps.min(axis=1) < 2.0 * config.gap_scale)
+        if near < 1e-3 * config.false_alarm * weights.sum():
+            return False
+        cloud.shift(moves)
+        cloud.reweigh(factors)
+    friction = cloud.friction if dynamics.friction else np.full(len(cloud.friction), _ANY_FRICTION)
+    cloud.reweigh(likelihoods(config, touch, contacts, friction))
+    return True
 
 
 def likelihoods(
@@ -154,30 +193,18 @@ def onto_manifold(
     config: TouchConfig,
     touch: Touch,
     dynamics: BeliefDynamics,
-    poses: NDArray,
+    then: Snapshot,
     weights: NDArray,
     contacts: ParticleContacts,
-    point: NDArray,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Move a share of the particles to where the end effectors that feel something touch them.
+    """Moves (P, 3) of a share of the particles to where the end effectors that feel something touch them.
 
     A moved particle stands for the density of the belief on the manifold, taken from its Gaussian
     approximation: how dense it is there along the normal, times the width over which a contact is felt.
-
-    Args:
-        config: how forces are read.
-        touch: what was measured.
-        dynamics: shape of the object and end effectors.
-        poses: of the particles, shape (P, 3).
-        weights: of them, shape (P,).
-        contacts: of the particles.
-        point: plane coordinates, shape (m,).
-        rng: source of randomness.
-
-    Returns:
-        moves (P, 3) and factors of the weights (P,).
+    Returned with the moves are these factors of the weights (P,).
     """
+    poses, point = then.poses, then.point
     moves, factors = np.zeros_like(poses), np.ones(len(poses))
     felt = _felt_by(touch, contacts)
     near = contacts.gaps[:, felt] < 2.0 * config.gap_scale

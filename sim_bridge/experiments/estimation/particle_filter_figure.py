@@ -3,6 +3,7 @@
 import pathlib
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_bridge.experiments.estimation.filters import VARIANTS, Comparison
 
@@ -48,6 +49,6 @@ def write(path: pathlib.Path, comparisons: list[Comparison]) -> None:
     plt.close(figure)
 
 
-def _dark(comparison: Comparison, times: np.ndarray) -> np.ndarray:
+def _dark(comparison: Comparison, times: np.ndarray) -> NDArray[np.bool_]:
     dropouts = comparison.dropouts
-    return ((times[:, None] >= dropouts[:, 0]) & (times[:, None] < dropouts[:, 1])).any(axis=1)
+    return np.any((times[:, None] >= dropouts[:, 0]) & (times[:, None] < dropouts[:, 1]), axis=1)
