@@ -88,8 +88,7 @@ class ObjectParticleFilter:
             return Outcome("stale", f"time goes back by {-gap:.4g} s")
         jump = float(np.abs(point - cloud.head.point).max())
         known = gap <= self.config.longest_gap and jump <= self.config.longest_jump
-        before = cloud.head.point if known else point
-        poses = cloud.head.poses
+        before, poses = cloud.head.point if known else point, cloud.head.poses
         if cloud.begun:
             path = self._motion.refined(before, point)
             poses = self._motion.drawn(cloud, poses, gap, path, self._rng)
@@ -263,10 +262,8 @@ class ObjectParticleFilter:
 
     def _contradicted(self, measurement: PoseMeasurement, doubt: float) -> Outcome:
         """Count what the belief cannot explain; enough of it in agreement means that the belief is wrong."""
-        config = self.config
-        if self._pending and not could_follow(
-            self._pending[-1], measurement, config.max_speed, max_gap=config.lost_after
-        ):
+        config, last = self.config, self._pending[-1:]
+        if last and not could_follow(last[0], measurement, config.max_speed, max_gap=config.lost_after):
             self._pending.clear()
         self._pending.append(measurement)
         count = len(self._pending)
