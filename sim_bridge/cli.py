@@ -79,6 +79,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.reaching.reach_clutter",
         "the arm between random postures in cluttered cells",
     ),
+    "bimanual": Choice(
+        "sim_bridge.experiments.robust_pushing.bimanual",
+        "two arms push a can along a circle without sensors",
+    ),
     "search": Choice(
         "sim_bridge.experiments.search.choices",
         "every option of the search against its alternatives",

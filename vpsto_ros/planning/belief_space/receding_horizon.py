@@ -97,6 +97,7 @@ class RobustPusher:
         """Set up the planner; see :class:`RobustPushingProblem` for the arguments."""
         self.config, self.dynamics, self.space, self.rule = config, dynamics, space, rule
         self.rng, self.reach = rng, reach
+        self._quiet = dataclasses.replace(dynamics, friction=False, step_variance=0.0, way_variance=0.0)
 
     def horizon(
         self,
@@ -127,7 +128,7 @@ class RobustPusher:
         config = self.config
         problem = RobustPushingProblem(
             config, self.dynamics, self.space, self.rule, start=start, velocity=velocity,
-            belief=self._planning_belief(belief), way=way, reach=self.reach, start_time=start_time,
+            belief=self._planning_belief(belief, start), way=way, reach=self.reach, start_time=start_time,
             contact=contact,
         )  # fmt: skip
         result = search(
@@ -169,7 +170,7 @@ class RobustPusher:
         began, q, dynamics = time.perf_counter(), np.asarray(start, dtype=float), self.dynamics
         if not self.config.robust:  # the baseline takes the expected place and the nominal model for true
             belief = ObjectBelief(np.tile(belief.mean, (2, 1)))
-            dynamics = dataclasses.replace(dynamics, friction=False, step_variance=0.0, way_variance=0.0)
+            dynamics = self._quiet
         qd = np.zeros_like(q) if velocity is None else np.asarray(velocity, dtype=float)
         history = _History(belief, start_time)
         motion: Trajectory | None = None
@@ -196,14 +197,22 @@ class RobustPusher:
             motion = motion.followed_by(brake)
         return history.plan(motion, target.reached(progress, belief), belief, time.perf_counter() - began)
 
-    def _planning_belief(self, belief: ObjectBelief) -> ObjectBelief:
-        """A few particles, jittered; the baseline believes in the mean alone."""
+    def _planning_belief(self, belief: ObjectBelief, start: NDArray) -> ObjectBelief:
+        """A few particles, jittered, none of them inside a tool; the baseline believes in the mean alone.
+
+        A particle that jitter had left between two tools would be squeezed by whatever they do next, and no
+        candidate would be valid.
+        """
         config = self.config
         if not config.robust:
             return ObjectBelief(np.tile(belief.mean, (2, 1)))
         if belief.count != config.particles:
             belief = belief.resampled(config.particles, self.rng)
-        return belief.jittered(config.jitter, self.rng) if config.jitter > 0.0 else belief
+        if config.jitter == 0.0:
+            return belief
+        here = self.space.plane(start[None, None])[0][0, 0]
+        jittered = belief.jittered(config.jitter, self.rng)
+        return self._quiet.simulate(jittered, np.stack([here, here]), self.rng).belief
 
     def _path(self, motion: Trajectory, begin: float, end: float) -> NDArray:
         """Plane coordinates between two times, as finely as the steps of a horizon."""

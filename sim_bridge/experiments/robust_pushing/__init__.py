@@ -1,0 +1,1 @@
+"""Experiments on robust pushing with simulated arms (6.6)."""
