@@ -274,6 +274,22 @@ def test_mirrored_balls_are_mirrored_joints():
     np.testing.assert_allclose(mirrored, np.hstack([q[:, 7:] * sign, q[:, :7] * sign]), atol=1e-12)
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.01, -0.01])
+def test_reach_of_two_balls_agrees_with_that_of_their_arms(margin):
+    """The compiled check against each arm's own, and for any shape of points."""
+    plane = PLANES["balls"]()
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 500, 4))
+    points[3, 3] = np.nan
+    expected = np.ones((40, 500), dtype=bool)
+    for k, arm in enumerate(plane._arms):
+        flange = points[..., 2 * k : 2 * k + 2] + plane._shift[k]
+        pan = np.arctan2(flange[..., 1], flange[..., 0])
+        expected &= arm.reaches(flange, margin) & arm.within([0, 6], np.stack([pan, pan], axis=-1))
+    np.testing.assert_array_equal(plane.contains(points, margin), expected)
+    assert 0.05 < expected.mean() < 0.5
+    assert plane.contains(points[0, 0], margin).shape == ()
+
+
 def test_out_of_reach_and_wrong_shapes_are_errors_in_words():
     balls, hand = PLANES["balls"](), PLANES["hand"]()
     assert not balls.contains([0.5, 0.1, 1.2, -0.1]) and balls.contains([0.5, 0.1, 0.5, -0.1])

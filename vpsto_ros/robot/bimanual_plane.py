@@ -1,6 +1,9 @@
 """Two balls on two arms in the plane above the table."""
 
+import math
+
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.exceptions import InvalidInputError
@@ -64,6 +67,8 @@ class BimanualPlane:
             for side, part in (("left", slice(0, 7)), ("right", slice(7, 14)))
         ]
         self.radius_range = self._arms[0].radius_range
+        # The crank keeps its direction, so that joint 7 turns as far as joint 1.
+        self._bounds = np.array([[*arm.radius_range, *arm.shared_range([0, 6])] for arm in self._arms])
         probe = np.array([0.5, 0.1, 0.52, -0.12])
         q = self.joints(probe[None])[0]
         reached = np.concatenate([robot.forward(q, tip)[0] for tip in TIP_NAMES])
@@ -108,12 +113,10 @@ class BimanualPlane:
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether both balls, shape (..., 4), are within reach and joint limits, margin [m] from the ends."""
         points = np.asarray(points, dtype=float)
-        inside = np.ones(points.shape[:-1], dtype=bool)
-        for k, arm in enumerate(self._arms):
-            flange = points[..., 2 * k : 2 * k + 2] + self._shift[k]
-            pan = np.arctan2(flange[..., 1], flange[..., 0])
-            inside &= arm.reaches(flange, margin) & arm.within([0, 6], np.stack([pan, pan], axis=-1))
-        return inside
+        inside = np.empty(points.shape[:-1], dtype=bool)
+        rows = np.ascontiguousarray(points).reshape(-1, 4)
+        _within_reach(rows, self._shift, self._bounds, margin, inside.reshape(-1))
+        return inside[()]
 
     def arms_apart(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether no part of one arm is within 5 mm of the other, for (x_l, y_l, x_r, y_r), shape (..., 4).
@@ -151,3 +154,29 @@ class BimanualPlane:
     def tool_heights(self, q: ArrayLike) -> NDArray[np.float64]:
         """Heights (..., 2) [m] of the balls' centres above the table for joint positions (..., 14) [rad]."""
         return self.tips(q)[..., 2]
+
+
+@njit(cache=True, nogil=True)
+def _within_reach(points, shift, bounds, margin, inside):
+    """Whether both balls are within reach and joint limits.
+
+    Args:
+        points: (x_l, y_l, x_r, y_r), shape (K, 4) [m].
+        shift: from a ball to the flange of its arm, in the frame of that arm's base, shape (2, 2) [m].
+        bounds: least and greatest radius and direction of each flange, shape (2, 4) [m, m, rad, rad].
+        margin: kept from the ends of the radii [m].
+        inside: output, shape (K,).
+    """
+    for i in range(points.shape[0]):
+        good = True
+        for k in range(2):
+            x, y = points[i, 2 * k] + shift[k, 0], points[i, 2 * k + 1] + shift[k, 1]
+            square = x * x + y * y
+            near, far = bounds[k, 0] + margin, bounds[k, 1] - margin
+            good = good and near * near <= square and square <= far * far
+            # No angle is needed in front of the base where all of the front is allowed.
+            front = x > 0.0 and bounds[k, 2] <= -0.5 * math.pi and bounds[k, 3] >= 0.5 * math.pi
+            if good and not front:
+                pan = math.atan2(y, x)
+                good = bounds[k, 2] <= pan and pan <= bounds[k, 3]
+        inside[i] = good

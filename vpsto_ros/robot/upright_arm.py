@@ -77,6 +77,13 @@ class UprightArm:
         lower, upper = self._lower[joints] + self._margin, self._upper[joints] - self._margin
         return np.all((angles >= lower) & (angles <= upper), axis=-1)
 
+    def shared_range(self, joints: list[int]) -> tuple[float, float]:
+        """Range of an angle [rad] that is the position of several joints and keeps the margin in each."""
+        return (
+            float(self._lower[joints].max()) + self._margin,
+            float(self._upper[joints].min()) - self._margin,
+        )
+
     def reaches(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
         """Whether points (..., 2) [m] lie in radius_range, at least margin [m] from its ends."""
         radii = np.linalg.norm(np.asarray(points, dtype=float), axis=-1)
