@@ -53,7 +53,7 @@ EXPERIMENTS = {
     ),
     "particle_filter": Choice(
         "sim_bridge.experiments.estimation.particle_filter",
-        "where a pushed can is while the camera sees nothing, with touch and without",
+        "track a pushed can that is seen, unseen or felt only",
     ),
     "clutter_2d": Choice(
         "sim_bridge.experiments.clutter.clutter_2d",
