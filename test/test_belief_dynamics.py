@@ -138,6 +138,17 @@ def test_the_noise_is_tangential_zero_mean_and_where_there_is_contact(shape):
     np.testing.assert_array_equal(back.poses[-1, :, :2], positions)
 
 
+def test_the_noise_of_a_turned_box_is_along_its_side():
+    yaw, v_w, count = 0.7, 1e-6, 4000
+    along, side = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+    path = -np.outer([0.06 + FINGER, 0.06 + FINGER - 0.002], along)
+    belief = ObjectBelief(np.tile([0.0, 0.0, yaw], (count, 1)))
+    model = BeliefDynamics(BOX, ONE, step_variance=v_w)
+    moved = model.simulate(belief, path, np.random.default_rng(16)).poses[-1]
+    np.testing.assert_allclose(moved[:, :2] @ along, 0.002, atol=1e-5)
+    assert (moved[:, :2] @ side).var() == pytest.approx(v_w, rel=4.0 * math.sqrt(2.0 / count))
+
+
 @pytest.mark.parametrize("shape", [DISC, BOX], ids=["disc", "box"])
 def test_noise_does_not_make_anything_penetrate(shape):
     """A second finger waits beside: what the perturbation pushes into it is projected out."""

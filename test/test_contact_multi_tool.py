@@ -259,6 +259,33 @@ def test_a_turning_rectangle_sweeps_a_box_aside():
     assert not states(model, belief_of(np.zeros((2, 3))), still)[0].any()
 
 
+@pytest.mark.parametrize("tool", ["disc", "two discs", "mixed"])
+def test_a_coarse_sampling_of_a_straight_path_changes_nothing(tool):
+    """Steps are cut to substeps, which carry their own part of the slip."""
+    effectors, t = TOOLS[tool], np.linspace(0.0, 1.0, 41)[:, None]
+    begin = {"disc": [-0.0755, 0.012], "two discs": [-0.0755, 0.03, -0.0755, -0.01]}.get(
+        tool, [-0.0755, 0.03, -0.071, -0.02, 0.0]
+    )
+    way = np.zeros(effectors.dof)
+    way[list(effectors.columns)] = 0.076
+    path, belief = np.array(begin) + t * way, belief_of(np.zeros((2, 3)), friction=[0.3, 0.1])
+    model = quiet(BOX, effectors, friction=True)
+    fine, coarse = states(model, belief, path)[0], states(model, belief, path[::8])[0]
+    assert np.abs(fine[-1, :, 0]).min() > 0.04
+    np.testing.assert_allclose(coarse, fine[::8], atol=1e-9)
+
+
+def test_a_tool_that_turns_far_in_one_step_does_not_jump_over_the_object():
+    bar = EndEffectors((Rectangle(half_size=(0.15, 0.01)),))
+    model, belief = quiet(BOX, bar, friction=True), belief_of(np.zeros((2, 3)), friction=[0.2, 0.2])
+    coarse = np.array([[-0.12, -0.055, -0.3], [-0.12, -0.055, 0.9]])
+    fine = coarse[0] + np.linspace(0.0, 1.0, 200)[:, None] * (coarse[1] - coarse[0])
+    ours, expected = (states(model, belief, path)[0][-1, 0] for path in (coarse, fine))
+    assert expected[2] > 0.5
+    np.testing.assert_allclose(ours[:2], expected[:2], atol=2e-3)
+    assert ours[2] == pytest.approx(expected[2], abs=0.03)
+
+
 @pytest.mark.parametrize("tool", TOOLS)
 def test_motion_does_not_depend_on_the_frame(tool):
     effectors, rng = TOOLS[tool], np.random.default_rng(3)

@@ -354,6 +354,15 @@ def test_no_invalid_candidate_is_cheaper_than_a_valid_one(options):
     assert evaluation.cost[~evaluation.valid].min() >= INVALID_COST
 
 
+def test_an_object_that_jumps_makes_a_plan_invalid():
+    free, strict = problem(), problem(longest_step=0.002)
+    points = free.prior().sample(np.random.default_rng(16), 300)
+    jumps = free.outcome(points).prediction.step > 0.002
+    before, after = free.evaluate(points).valid, strict.evaluate(points).valid
+    assert (before & jumps).any() and after.any()
+    np.testing.assert_array_equal(after, before & ~jumps)
+
+
 def test_a_worse_violation_costs_more():
     posed = problem(contact_prior=False, robust=False)
     still = np.tile(START, (3, 2, 1))
@@ -437,7 +446,7 @@ def success(planner, plan, target, std, rollouts=1000):
 def plans():
     """Robust plans and those of the baseline for the circle, by seed."""
     found = {}
-    for robust, seed in itertools.product((True, False), (0, 1)):
+    for robust, seed in itertools.product((True, False), (0, 1, 2)):
         planner = pusher(seed, robust=robust)
         found[robust, seed] = planner, planner.plan(START, belief(seed=100 + seed), CIRCLE)
     return found
@@ -468,8 +477,8 @@ def test_robust_plans_hold_in_noisy_rollouts_and_those_of_the_baseline_do_not(pl
         key: success(planner, plan, CIRCLE, 0.005 if key[0] else 0.0)
         for key, (planner, plan) in plans.items()
     }
-    robust, baseline = (np.mean([shares[kind, s] for s in (0, 1)]) for kind in (True, False))
-    assert min(shares[True, s] for s in (0, 1)) > 0.95
+    robust, baseline = (np.mean([shares[kind, s] for s in (0, 1, 2)]) for kind in (True, False))
+    assert min(shares[True, s] for s in (0, 1, 2)) > 0.85
     assert baseline < robust - 0.2
 
 
@@ -592,6 +601,24 @@ def test_the_joint_space_prior_keeps_height_and_touches():
         assert (np.diag(spreads) < 1.1 * np.diag(covariance)).all()
         if spread == 3.0:
             np.testing.assert_allclose(spreads, covariance, atol=0.05 * covariance.max())
+
+
+def test_candidates_beyond_joint_limits_or_off_their_height_are_invalid():
+    planner = joint_pusher(robust=False, smoothness_spread=0.01)
+    start = TOOLS.joints(START[None])[0]
+    posed = RobustPushingProblem(
+        planner.config, planner.dynamics, planner.space, planner.rule, start=start,
+        velocity=np.zeros(14), belief=belief(), way=np.array([[0.6, 0.0, 0.0]]),
+    )  # fmt: skip
+    still = np.tile(start, (3, 2, 1))
+    upper = planner.space.limits.upper
+    # Joint 2 lifts the ball; no other joint than 1 and 7 leaves its height where it is.
+    still[1, :, 1] += 0.05
+    still[2, :, 0] += 1.2 * (upper[0] - start[0])
+    excess, valid = posed.outcome(still).excess, posed.evaluate(still).valid
+    np.testing.assert_array_equal(valid, [True, False, False])
+    assert excess[1] > 0.01
+    assert excess[2] >= 0.2 * (upper[0] - start[0]) - 1e-9
 
 
 def test_joint_space_plans_keep_joint_limits_and_heights():
