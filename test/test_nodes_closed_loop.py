@@ -43,8 +43,9 @@ MOVING, RESTING = 0.1, 0.02
 class System:
     """The processes, and an observer of their topics. No figure of it depends on how fast the host is."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, parameters=None):
         self.folder, self.processes = folder, {}
+        self.parameters = [] if parameters is None else ["--params-file", str(parameters)]
         self.node = rclpy.create_node("observer")
         self.executor = rclpy.executors.SingleThreadedExecutor()
         self.executor.add_node(self.node)
@@ -68,7 +69,7 @@ class System:
         simulated = [] if name == "franka_driver" else ["-p", "use_sim_time:=true"]
         # A driver that is slowed down leaves a busy host the time to plan; deadlines are in node time.
         pace = ["-p", "real_time_factor:=0.5"] if name == "franka_driver" else []
-        command = [sys.executable, "-c", code, "--ros-args", *simulated, *pace]
+        command = [sys.executable, "-c", code, "--ros-args", *self.parameters, *simulated, *pace]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
         with open(self.folder / f"{name}.log", "ab") as log:
             self.processes[name] = subprocess.Popen(
@@ -137,9 +138,9 @@ class System:
 
 
 @pytest.fixture
-def system(tmp_path):
+def system(tmp_path, request):
     rclpy.init()
-    made = System(tmp_path)
+    made = System(tmp_path, getattr(request, "param", None))
     try:
         yield made
     finally:
@@ -195,3 +196,29 @@ def test_pushing_survives_a_killed_planner_and_a_restarted_driver(system):
     system.push(goal, lambda: progress() > 0.03, "the box moves again")
     fresh_driver_status(system)
     assert_limits_were_kept(system)
+
+
+@pytest.mark.parametrize("system", [ROOT / "config" / "bimanual_push.yaml"], indirect=True)
+def test_two_arms_push_by_a_belief_and_stop_while_nobody_has_one(system):
+    for name in MODULES:
+        system.start(name)
+    system.wait(lambda: system.ready(*MODULES) and system.object is not None, "all nodes report")
+    assert len(system.joints.name) == 14
+
+    goal = np.array([0.5, 0.0])
+    start = np.linalg.norm(system.position() - goal)
+    system.push(goal, lambda: np.linalg.norm(system.position() - goal) < start - 0.03, "the can moves")
+
+    system.end("state_estimator", signal.SIGKILL)
+    killed = system.time
+    system.wait(lambda: system.time > killed + 3.0, "three seconds pass")
+    assert system.speed() < RESTING, "without a belief the arms rest"
+    system.wait(lambda: system.status["mpc_planner"][0] == 1, "the planner says so")
+    assert "belief over the object is" in system.status["mpc_planner"][1]
+
+    system.start("state_estimator")
+    system.push(goal, lambda: np.linalg.norm(system.position() - goal) < 0.03, "the can is at its goal")
+    fresh_driver_status(system)
+    assert_limits_were_kept(system)
+    values = system.status["franka_driver"][2]
+    assert all(values[f"contact.{kind}.steps"] == "0" for kind in ("arms", "table", "object")), values

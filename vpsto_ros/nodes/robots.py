@@ -33,7 +33,7 @@ class RobotConfig:
         + ", ".join(f"{kind.height:g} for {name}" for name, kind in TOOL_KINDS.items()),
         unit="m",
         minimum=0.0,
-        maximum=0.3,
+        maximum=1.0,
     )
 
     def __post_init__(self) -> None:
