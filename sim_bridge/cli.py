@@ -89,23 +89,23 @@ EXPERIMENTS = {
     ),
     "belief_1d": Choice(
         "sim_bridge.experiments.belief.belief_1d",
-        "the belief over a box on a line: closed form, particles, prediction",
+        "belief over a box on a line: closed form and particles",
     ),
     "variance_gain": Choice(
         "sim_bridge.experiments.belief.variance_gain",
-        "a disc pushed by one finger, a flat side, two fingers: predicted gain",
+        "variance of a disc pushed by one finger, a side, two fingers",
     ),
     "contact_prior": Choice(
         "sim_bridge.experiments.belief.contact_prior",
-        "how many candidates touch the object, with the contact prior and without",
+        "candidates that touch, with the contact prior and without",
     ),
     "robust_push_2d": Choice(
         "sim_bridge.experiments.belief.robust_push_2d",
-        "a rectangle pushes a disc into a region in one horizon or in many",
+        "a rectangle pushes a disc into a region, open loop",
     ),
     "belief_ablation": Choice(
         "sim_bridge.experiments.belief.belief_ablation",
-        "two balls push a disc around a circle: iterations, prior, joints",
+        "two balls, a disc, a circle: iterations, prior, joints",
     ),
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_bridge import bench, cli
-from sim_bridge.bench import library_rows, system_rows
+from sim_bridge.bench import belief_rows, library_rows, system_rows
 from sim_bridge.bench.comparison import compare
 from sim_bridge.bench.growth import exponent, growth_tables, in_words
 from sim_bridge.bench.measuring import (
@@ -196,6 +196,22 @@ def test_the_sentence_below_a_table_is_about_its_exponents():
     ]
 
 
+def test_growth_of_an_iteration_in_belief_space():
+    rows = [row_entries(belief_rows.iteration_name(b, p, k), b * p**0.5 * k) for b, p, k in belief_rows.SIZES]
+    *_, words = growth_tables(rows).splitlines()
+    assert words == (
+        "cost grows with the candidates about linearly (exponent 1.00), with the particles more slowly than "
+        "linearly (exponent 0.50), with the steps about linearly (exponent 1.00)"
+    )
+    assert growth_tables(rows[1:]) == ""
+
+
+@pytest.mark.parametrize("row", belief_rows.ROWS, ids=lambda row: row.name)
+def test_every_row_in_belief_space_works(row):
+    (first, *_) = measure_once(row, 1, Effort(calls=1))
+    assert first > 0.0
+
+
 def test_the_figures_wanted():
     wanted = {row.name: (row.wanted.entry, row.wanted.bound) for row in bench.ROWS if row.wanted is not None}
     assert wanted == {
@@ -205,6 +221,11 @@ def test_the_figures_wanted():
         "vpsto_iteration_b64_n7_box": ("p50_ms", 2.0),
         "posture_checks": ("checks_per_s", 1e6),
         "solve_clutter_2d": ("p50_ms", 100.0),
+        "belief_iteration_4dof_b30_p20_k50": ("p50_ms", 0.4),
+        "belief_iteration_4dof_b30_p20_k50_rich": ("p50_ms", 0.8),
+        "belief_iteration_14dof_b30_p20_k50": ("p50_ms", 1.0),
+        "robust_circle_plan": ("p50_ms", 500.0),
+        "robust_circle_plan_rich": ("p50_ms", 1500.0),
         "mpc_step_push_box": ("p99_ms", 16.0),
         "driver": ("real_time_factor", 20.0),
     }

@@ -10,14 +10,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from sim_bridge.bench import library_rows, system_rows
+from sim_bridge.bench import belief_rows, library_rows, system_rows
 from sim_bridge.bench.comparison import compare, comparison_table, place, read_rows
 from sim_bridge.bench.growth import growth_tables
 from sim_bridge.bench.measuring import QUICK, Effort, Row, measure_once, statistics, usable_cores
 from sim_bridge.experiments.runs import print_verdict
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
-ROWS: tuple[Row, ...] = library_rows.ROWS + system_rows.ROWS
+ROWS: tuple[Row, ...] = library_rows.ROWS + belief_rows.ROWS + system_rows.ROWS
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -94,7 +94,7 @@ def measure_all(rows: Sequence[Row], effort: Effort) -> list[dict[str, Any]]:
     passes: dict[tuple[str, int], list[list[float]]] = {(row.name, cores): [] for row, cores in places}
     results = []
     times = " ".join(f"{title:>10s}" for title in ("p50 [ms]", "p99 [ms]", "max [ms]"))
-    print(f"{'name':34s} {'cores':>5s} {times}   wanted", flush=True)
+    print(f"{'name':38s} {'cores':>5s} {times}   wanted", flush=True)
     with tqdm(total=effort.passes * len(places), disable=None, leave=False) as bar:
         for number in range(effort.passes):
             for row, cores in places:
@@ -114,7 +114,7 @@ def line(row: dict[str, Any]) -> str:
     extra = f"{row['real_time_factor']:.1f} x real time" if "real_time_factor" in row else ""
     if "checks_per_s" in row:
         extra = f"{row['checks_per_s'] / 1e6:.2f} million checks per second"
-    return f"{row['name']:34s} {row['cores']:5d} {times}   {wanted:26s} {extra}".rstrip()
+    return f"{row['name']:38s} {row['cores']:5d} {times}   {wanted:26s} {extra}".rstrip()
 
 
 def report_wanted(measured: Sequence[dict[str, Any]]) -> int:

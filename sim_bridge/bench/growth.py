@@ -1,4 +1,4 @@
-"""How cost grows with the degrees of freedom and with the number of candidates."""
+"""How cost grows with degrees of freedom, candidates, particles and steps."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sim_bridge.bench.belief_rows import SIZES, iteration_name
 from sim_bridge.bench.library_rows import BATCHES, DIMENSIONS, DOF, POPULATION
 from sim_bridge.experiments.runs import markdown_table
 
@@ -26,7 +27,8 @@ def growth_tables(rows: Sequence[Entries]) -> str:
     synthesis = _synthesis({row["name"]: row["p50_ms"] for row in single})
     # CMA-ES decomposes its covariance only every few iterations, which a median does not see.
     search = _search({row["name"]: row["mean_ms"] for row in single})
-    return "\n".join(table for table in (synthesis, search) if table)
+    belief = _belief({row["name"]: row["mean_ms"] for row in single})
+    return "\n".join(table for table in (synthesis, search, belief) if table)
 
 
 def exponent(sizes: Sequence[float], times: Sequence[float]) -> float:
@@ -75,3 +77,22 @@ def _search(times: dict[str, float]) -> str:
         words.append(f"{name} grows {in_words([power])}")
     header = ["search", *(f"{d} variables" for d in DIMENSIONS), "exponent"]
     return f"one iteration of the search, mean\n{markdown_table(header, rows)}{', '.join(words)}\n"
+
+
+def _belief(times: dict[str, float]) -> str:
+    """One size grows, the others stay as plans have them; the times contain what does not grow with it."""
+    names = [iteration_name(*size) for size in SIZES]
+    if not all(name in times for name in names):
+        return ""
+    rows, words = [], []
+    for place, label in enumerate(("candidates", "particles", "steps")):
+        others = [i for i in range(3) if i != place]
+        grown = sorted(size for size in SIZES if all(size[i] == SIZES[0][i] for i in others))
+        sizes, row = [size[place] for size in grown], [times[iteration_name(*size)] for size in grown]
+        power, last = exponent(sizes, row), exponent(sizes[-2:], row[-2:])
+        cells = [f"{size}: {time:.3f} ms" for size, time in zip(sizes, row, strict=True)]
+        rows.append([label, *cells, f"{power:.2f}", f"{last:.2f}"])
+        words.append(f"with the {label} {in_words([power])}")
+    header = ["what grows", "as in plans", "4 times", "16 times", "exponent", "from 4 to 16 times"]
+    table = markdown_table(header, rows)
+    return f"one iteration of BS-VP-STO for 4 coordinates, mean\n{table}cost grows {', '.join(words)}\n"

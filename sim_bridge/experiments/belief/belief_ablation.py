@@ -46,7 +46,7 @@ class Task:
     curve: str
     iterations: int
     seed: int
-    horizons: int = HORIZONS
+    horizons: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +98,7 @@ def solve(task: Task) -> Outcome:
 def warm_up() -> None:
     """Compile what plans use."""
     for curve in CURVES:
-        solve(Task(curve, 1, 0, horizons=2))
+        solve(Task(curve, 1, 0, 2))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Plan for every point of every curve; 0 when the success rates are as high as in the thesis."""
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     points = [(curve, iterations) for curve in CURVES for iterations in ITERATIONS]
-    tasks = [Task(*point, seed) for point in points for seed in seeds]
+    tasks = [Task(*point, seed, HORIZONS) for point in points for seed in seeds]
     found = run_trials(solve, tasks, Execution.from_arguments(arguments), "belief_ablation", warm_up)
     outcomes = {point: found[i * len(seeds) : (i + 1) * len(seeds)] for i, point in enumerate(points)}
     rows = {curve: {m: summarise(outcomes[curve, m]) for m in ITERATIONS} for curve in CURVES}

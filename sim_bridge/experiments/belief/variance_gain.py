@@ -108,10 +108,10 @@ def gains(push: Push, model: Model, rng: np.random.Generator) -> Gains:
     many, few, fresh = belief(PARTICLES, rng), belief(FEW, rng), belief(PARTICLES, rng)
     predicted, contact = predicted_gain(exact, many, push.path)
     before = many.variance + PERTURBATION
-    sampled = np.mean([sampled_variance(exact, many, push.path, rng) for _ in range(DRAWS)])
+    sampled = sampled_variance(exact, many, push.path, rng)
     after = noisy.simulate(fresh, push.path, rng).belief.variance
     return Gains(
-        predicted, predicted_gain(exact, few, push.path)[0], float(sampled) / before,
+        predicted, predicted_gain(exact, few, push.path)[0], sampled / before,
         after / (fresh.variance + PERTURBATION), contact,
     )  # fmt: skip
 
@@ -126,14 +126,14 @@ def predicted_gain(dynamics: BeliefDynamics, prior: ObjectBelief, path: NDArray)
 def sampled_variance(
     dynamics: BeliefDynamics, prior: ObjectBelief, path: NDArray, rng: np.random.Generator
 ) -> float:
-    """Variance of f(q, u) + eta w over particles and perturbations, the left side of (6.18)."""
+    """Variance of f(q, u) + eta w over particles and sampled perturbations, the left side of (6.18)."""
     poses = dynamics.simulate(prior, path, rng).belief.poses  # without noise: f
     eta = (poses[:, :2] != prior.poses[:, :2]).any(axis=1)
-    w = np.sqrt(PERTURBATION) * rng.standard_normal(prior.count)
-    after = poses[:, :2] + (eta * w)[:, None] * tangents(dynamics, poses, path)
-    # Perturbations add V_w (1 - 1 / P) to the variance of P particles about their own mean.
-    shift = after.mean(axis=0) - poses[:, :2].mean(axis=0)
-    return float(((after - after.mean(axis=0)) ** 2).sum(axis=1).mean() + shift @ shift)
+    directions = eta[:, None] * tangents(dynamics, poses, path)
+    w = np.sqrt(PERTURBATION) * rng.standard_normal((DRAWS, prior.count, 1))
+    after = poses[:, :2] + w * directions
+    # About the mean of f: that of so many particles is the expectation, their perturbations' own is not.
+    return float(((after - poses[:, :2].mean(axis=0)) ** 2).sum(axis=2).mean())
 
 
 def tangents(dynamics: BeliefDynamics, poses: NDArray, path: NDArray) -> NDArray:
