@@ -21,7 +21,7 @@ def write(path: pathlib.Path, rows: Mapping[str, Mapping[int, Mapping[str, Any]]
 
     from sim_bridge.experiments.belief.belief_ablation import CURVES
 
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(16, 5.2), layout="constrained")
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(16, 5.6), layout="constrained")
     figure.suptitle(
         "Two balls push a disc along a circle: iterations per horizon, contact prior, joints (Fig. 6.13)"
     )
@@ -46,6 +46,6 @@ def write(path: pathlib.Path, rows: Mapping[str, Mapping[int, Mapping[str, Any]]
         axes.grid(alpha=0.3)
     for axes in (left, middle):
         axes.set_ylim(-4.0, 104.0)
-    left.legend(loc="center right", fontsize=9)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.savefig(path, dpi=100)
     plt.close(figure)
