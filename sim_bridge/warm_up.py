@@ -11,6 +11,7 @@ import time
 import numpy as np
 
 from sim_bridge.bench.library_rows import cell
+from sim_bridge.experiments.belief import belief_ablation, bimanual, robust_push_2d, variance_gain
 from sim_bridge.experiments.clutter.mpc_runs import Task, run_task
 from sim_bridge.experiments.clutter.mppi import MppiConfig
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
@@ -42,7 +43,7 @@ def run(_arguments: argparse.Namespace | None = None) -> int:
         0.
     """
     began = time.perf_counter()
-    pushing = push_a_box, move_two_arms, track_a_pushed_can
+    pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
     for use in (*pushing, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
@@ -74,6 +75,16 @@ def track_a_pushed_can() -> None:
             tracker.update(0.01 * step, np.array([0.5, 0.0, 0.0]), 1e-6 * np.eye(3))
             tracker.touch(0.01 * step, np.array([-2.0, 0.0]), 0.1)
         tracker.state(0.05)
+
+
+def push_by_a_belief() -> None:
+    """Robust plans of two arms and of a rectangle, the variance gain of a push, a box among two balls."""
+    belief_ablation.warm_up()
+    robust_push_2d.warm_up()
+    variance_gain.measure(0)
+    prior = bimanual.belief(2, np.random.default_rng(0))
+    path = np.tile(bimanual.START, (1, 2, 1))
+    BeliefDynamics(PlanarShape.box(0.1, 0.1), bimanual.BALLS).predict(prior, path)
 
 
 def evaluate_a_trajectory() -> None:

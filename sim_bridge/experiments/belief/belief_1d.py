@@ -105,9 +105,7 @@ def summarise(found: list[Estimate]) -> dict[str, Any]:
         "stops": len(STOPS),
         "max_deviation_standard_errors": worst[""],
         "max_mean_deviation_standard_errors": worst["_mean"],
-        "share_of_distributions_rejected_at_5_percent": float(
-            (distance > kstwo.ppf(0.95, PARTICLES)).mean()
-        ),
+        "share_of_distributions_rejected_at_5_percent": float((distance > kstwo.ppf(0.95, PARTICLES)).mean()),
         "max_prediction_error_centred": float(np.abs(ratios["centred"]).max()),
         "prediction_error_as_read": [float(ratios["as_read"].min()), float(ratios["as_read"].max())],
         "std_of_variance_from_20_particles": float((few.std(axis=0, ddof=1) / exact).mean()),

@@ -194,9 +194,9 @@ def sampled_times(motion: Trajectory) -> NDArray:
 def warm_up() -> None:
     """Compile what plans use."""
     for name in MODELS:
-        planner(Task("receding", name, True, 0), np.random.default_rng(0)).plan(
-            START, belief(50, np.random.default_rng(0)), GoalTarget(GOAL), horizons=2
-        )
+        for way in WAYS:
+            rng = np.random.default_rng(0)
+            planner(Task(way, name, True, 0), rng).plan(START, belief(50, rng), GoalTarget(GOAL), horizons=1)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -210,9 +210,7 @@ def run(arguments: argparse.Namespace) -> int:
     variants = [(way, model, robust) for way in WAYS for model in MODELS for robust in (True, False)]
     tasks = [Task(*variant, seed) for variant in variants for seed in seeds]
     found = run_trials(solve, tasks, Execution.from_arguments(arguments), "robust_push_2d", warm_up)
-    plans = {
-        variant: found[i * len(seeds) : (i + 1) * len(seeds)] for i, variant in enumerate(variants)
-    }
+    plans = {variant: found[i * len(seeds) : (i + 1) * len(seeds)] for i, variant in enumerate(variants)}
     success = {way: float(np.mean([p.success[-1] for p in plans[way, THESIS.name, True]])) for way in WAYS}
     summary = {
         "experiment": "robust_push_2d",
