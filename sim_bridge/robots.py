@@ -1,6 +1,5 @@
 """The robots that can be simulated: models, tools, planes, and what MuJoCo has to know beyond the MJCF."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,13 +7,9 @@ import mujoco
 import numpy as np
 
 from vpsto_ros.robot import kinematics as fr3
-from vpsto_ros.robot.bimanual_plane import BimanualPlane
-from vpsto_ros.robot.hand_plane import HandPlane
-from vpsto_ros.robot.inverse_kinematics import TableMap
+from vpsto_ros.robot.kinds import ROD_RADIUS, TOOL_KINDS, ToolKind
 from vpsto_ros.robot.kinematics import Robot
 from vpsto_ros.robot.tool_plane import ToolPlane
-
-TOOL_RADIUS = 0.015  # of the rod [m]
 
 # Collision bits, contype and conaffinity. Links have LINK in both. A tool meets links, other tools and the
 # table; objects it meets by explicit pairs only.
@@ -47,33 +42,43 @@ class RobotKind:
 
     Attributes:
         model_path: its MJCF.
-        load: its model for controllers.
-        plane: the plane of its tools at a height [m].
+        tools: its model for controllers, and its tools.
         arms: its arms, in the order of the joints.
         nominal: plane point at which the damping of the controller is designed.
         round_tool: whether joint 7 turns a round tool about its own axis.
     """
 
     model_path: Path
-    load: Callable[[], Robot]
-    plane: Callable[[Robot, float], ToolPlane]
+    tools: ToolKind
     arms: tuple[Arm, ...]
     nominal: tuple[float, ...]
     round_tool: bool = False
 
+    def load(self) -> Robot:
+        """Its model for controllers."""
+        return self.tools.load()
+
+    def plane(self, robot: Robot, height: float) -> ToolPlane:
+        """The plane of its tools at a height [m]."""
+        return self.tools.plane(robot, height)
+
+
+def _arms(kind: str, *names: tuple[str, str]) -> tuple[Arm, ...]:
+    """Arms from prefixes and tools; messages call the tools as planners do."""
+    return tuple(Arm(*pair, frame) for pair, frame in zip(names, TOOL_KINDS[kind].frames, strict=True))
+
 
 KINDS = {
     "rod": RobotKind(
-        fr3.MODEL_PATH, fr3.fr3_pusher, TableMap, (Arm("", "rod", "fr3_tool"),), (0.5, 0.0), round_tool=True
+        fr3.MODEL_PATH, TOOL_KINDS["rod"], _arms("rod", ("", "rod")), (0.5, 0.0), round_tool=True
     ),
     "hand": RobotKind(
-        fr3.HAND_MODEL_PATH, fr3.fr3_hand_pusher, HandPlane, (Arm("", "hand", "fr3_tool"),), (0.5, 0.0, 0.0)
+        fr3.HAND_MODEL_PATH, TOOL_KINDS["hand"], _arms("hand", ("", "hand")), (0.5, 0.0, 0.0)
     ),
     "two_balls": RobotKind(
         fr3.BIMANUAL_MODEL_PATH,
-        fr3.fr3_bimanual,
-        BimanualPlane,
-        (Arm("left_", "left_ball", "left_fr3_tool"), Arm("right_", "right_ball", "right_fr3_tool")),
+        TOOL_KINDS["two_balls"],
+        _arms("two_balls", ("left_", "left_ball"), ("right_", "right_ball")),
         (0.5, 0.08, 0.5, -0.08),
     ),
 }
@@ -106,8 +111,8 @@ def _add_rod(spec: mujoco.MjSpec) -> None:
     spec.body("tool").add_geom(
         name="rod",
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=[0, 0, 0.05, 0, 0, fr3.TOOL_LENGTH - TOOL_RADIUS],
-        size=[TOOL_RADIUS, 0, 0],
+        fromto=[0, 0, 0.05, 0, 0, fr3.TOOL_LENGTH - ROD_RADIUS],
+        size=[ROD_RADIUS, 0, 0],
         mass=0.0,
         group=3,
         contype=ROD,

@@ -10,13 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from sim_bridge.report.recording import Recording
+
 ROOT = Path(__file__).resolve().parents[1]
 CHARTS = {"distance.png", "top_view.png", "joints.png", "compute.png"}
 PROMISED = {"summary.json", "report.html", "bag", "logs"} | CHARTS
 
 
-def start(out, *options):
-    command = [sys.executable, "-m", "sim_bridge.cli", "demo", "push_box", "--out", str(out), *options]
+def start(out, *options, demo="push_box"):
+    command = [sys.executable, "-m", "sim_bridge.cli", "demo", demo, "--out", str(out), *options]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
@@ -33,10 +35,10 @@ def nodes_of(out):
     return found
 
 
-@pytest.fixture(scope="module")
-def short_run(tmp_path_factory):
-    out = tmp_path_factory.mktemp("demo") / "push_box"
-    demo = start(out, "--duration", "5", "--seed", "4")
+@pytest.fixture(scope="module", params=["push_box", "bimanual_push"])
+def short_run(tmp_path_factory, request):
+    out = tmp_path_factory.mktemp("demo") / request.param
+    demo = start(out, "--duration", "5", "--seed", "4", demo=request.param)
     text = demo.communicate(timeout=240)[0]
     return out, demo.returncode, text
 
@@ -73,8 +75,22 @@ def test_every_topic_is_in_the_bag(short_run):
     assert counts["/joint_states"] > 100
 
 
-def test_no_limit_is_violated(short_run):
-    assert json.loads((short_run[0] / "summary.json").read_text())["limit_violations"] == 0
+def test_no_limit_is_violated_and_nothing_touched_that_should_not(short_run):
+    summary = json.loads((short_run[0] / "summary.json").read_text())
+    assert summary["limit_violations"] == 0
+    assert summary["contacts"] == {"arms": 0, "table": 0, "object": 0}
+
+
+def test_the_report_shows_what_the_nodes_drew(short_run):
+    recording = Recording.from_bag(short_run[0] / "bag")
+    middle = 0.5 * (recording.joints.time[0] + recording.joints.time[-1])
+    names = {overlay.name for overlay in recording.overlays(middle)}
+    expected = {"touch", "planned_tool_path", "predicted_object_path", "object_belief"}
+    if short_run[0].name == "bimanual_push":
+        expected |= {"contact_prior", "predicted_spread"}
+    all_of_them = [drawing for drawings in recording.drawn.values() for drawing in drawings]
+    drawn = {overlay.name for drawing in all_of_them for overlay in drawing.overlays}
+    assert names and names <= expected == drawn
 
 
 KILLING = """

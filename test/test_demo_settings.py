@@ -7,7 +7,7 @@ import yaml
 
 from sim_bridge.cli import DEMOS
 from sim_bridge.demo import settings as module
-from sim_bridge.demo.bimanual_push import CAN_AREA, TABLE_CENTRE
+from sim_bridge.demo.bimanual_push import KNOCK_AREA, TABLE_CENTRE
 from sim_bridge.demo.settings import Settings, _parameters, config_file, configured
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.contact_planner_config import ContactPlannerNodeConfig
@@ -60,7 +60,7 @@ def test_the_bimanual_demo_s_file_fits_all_nodes_and_they_agree():
     assert configs["mpc_planner"].robot.plane().height == settings.tools.height == settings.scene.height
     assert configs["mpc_planner"].kind == configs["contact_planner"].kind == "robust_pushing"
     space = configs["mpc_planner"].robust
-    corners = [np.array([x, y]) for x in CAN_AREA.x for y in CAN_AREA.y]
+    corners = [np.array([x, y]) for x in KNOCK_AREA.x for y in KNOCK_AREA.y]
     assert all(space.contains(np.array(point)) for point in (TABLE_CENTRE, *corners))
 
 

@@ -14,8 +14,8 @@ from sim_bridge.demo.verdict import Demo
 CAN_DISTANCE = 0.015
 """How near a can has to be: the planner rests within 8 mm of its estimate and resumes beyond 12 mm, and the
 estimate of a noisy, late camera errs by some millimetres [m]."""
-CAN_AREA = Area((0.43, 0.57), (-0.14, 0.14))
-"""Well inside the planner's default workspace for uncertain objects, knocks included."""
+CAN_AREA, KNOCK_AREA = Area((0.45, 0.56), (-0.13, 0.13)), Area((0.41, 0.6), (-0.2, 0.2))
+"""Where targets are, and where knocks may leave the can: inside the planner's default workspace."""
 TABLE_CENTRE = (0.5, 0.0)
 """Of the part of the table that both arms reach [m]."""
 
@@ -35,6 +35,7 @@ def can_scenario(rng: np.random.Generator, duration: float = 90.0) -> Scenario:
         CAN_AREA,
         CAN_DISTANCE,
         jump=0.1,
+        knock_area=KNOCK_AREA,
     )
 
 

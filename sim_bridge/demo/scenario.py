@@ -12,6 +12,8 @@ REACHED_DISTANCE = 0.010
 HOLD_TIME = 1.0
 DRIFT_SPEED = 0.02
 DRIFT_MEDIAN_DISTANCE = 0.025
+NEAR_TOOL = 0.2
+"""Tools farther away do not matter to the hand [m]."""
 LONGEST_STEP = 0.04
 """How far the hand's force may grow without seeing what it does [s]."""
 
@@ -144,7 +146,8 @@ class Scenario:
     Attributes:
         rng: chooses targets and knocks.
         phases: in order.
-        area: where targets are, and where knocks leave the object.
+        area: where targets are.
+        knock_area: where knocks leave the object; where targets are if None.
         reached_distance: how near to the target counts as being there [m].
         hold_time: for how long [s].
         jump: how far from the object a target is at least that jumps somewhere [m].
@@ -156,6 +159,7 @@ class Scenario:
     reached_distance: float = REACHED_DISTANCE
     hold_time: float = HOLD_TIME
     jump: float = 0.15
+    knock_area: Area | None = None
 
     def __post_init__(self) -> None:
         """Nothing has begun."""
@@ -240,13 +244,17 @@ class Scenario:
             self._drift_direction = -1.0 if self._goal[1] > 0.0 else 1.0
 
     def _aim(self, box: NDArray[np.float64], tools: NDArray[np.float64]) -> Knock:
-        """A shove of 6 to 9 cm, away from the tools, that leaves the object among the targets."""
-        behind = np.reshape(tools, (-1, 2)).mean(axis=0)
-        away = math.atan2(box[1] - behind[1], box[0] - behind[0])
+        """A shove of 6 to 9 cm, away from the tools, that leaves the object where it can be brought back."""
+        offsets = np.reshape(tools, (-1, 2)) - box
+        away = math.atan2(*-offsets.mean(axis=0)[::-1])
+        near = offsets[np.linalg.norm(offsets, axis=1) < NEAR_TOOL]
+        area = self.area if self.knock_area is None else self.knock_area
         for spread in np.linspace(0.3, math.pi, 200):
             angle, distance = away + self.rng.uniform(-spread, spread), self.rng.uniform(0.06, 0.09)
             direction = np.array([math.cos(angle), math.sin(angle)])
-            if self.area.contains(box + distance * direction):
+            # Against a tool the hand would press until the object slips out, no matter where to.
+            clear = bool((near @ direction <= 0.3 * np.linalg.norm(near, axis=1)).all())
+            if clear and area.contains(box + distance * direction):
                 break
         return Knock(direction, distance)
 

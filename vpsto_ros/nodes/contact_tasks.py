@@ -135,9 +135,9 @@ class RobustPushingContacts:
         covariances = np.array([plan.covariance[c, c] for c in columns])
         middle = places.mean(axis=0)
         return [
-            make.spheres("touch", places, markers.PLAN, 0.012),
-            make.ellipses("contact_prior", places, covariances, markers.PLAN),
-            make.line("push", middle + 0.6 * np.outer((0.0, 1.0), plan.velocity), markers.PLAN),
+            make.spheres("touch", places, markers.CONTACT, 0.012),
+            make.ellipses("contact_prior", places, covariances, markers.CONTACT),
+            make.line("push", middle + 0.6 * np.outer((0.0, 1.0), plan.velocity), markers.CONTACT),
         ]
 
     def _warm_up(self) -> None:
