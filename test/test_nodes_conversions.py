@@ -280,7 +280,27 @@ def test_beliefs_round_trip():
     poses = np.random.default_rng(0).normal(size=(40, 3))
     message = belief_message(poses, TimeBase().stamp(1.5), FRAME)
     assert TimeBase().seconds(message.header.stamp) == 1.5
-    assert np.allclose(read_belief(message, FRAME), poses, atol=1e-12)
+    wrapped = poses - [0.0, 0.0, 1.0] * (2.0 * np.pi * np.round(poses / (2.0 * np.pi)))
+    assert np.allclose(read_belief(message, FRAME), wrapped, atol=1e-12)
+    one_by_one = [read_pose(pose).pose for pose in message.poses]
+    assert np.allclose(read_belief(message, FRAME), one_by_one, atol=1e-12)
+    assert read_belief(belief_message(poses[:0], TimeBase().stamp(1.5), FRAME), FRAME).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda p: setattr(p.position, "x", math.nan), "position has a number that is not finite"),
+        (lambda p: setattr(p.position, "z", math.inf), "position has a number that is not finite"),
+        (lambda p: setattr(p.orientation, "w", math.nan), "quaternion has a number that is not finite"),
+        (lambda p: setattr(p.orientation, "w", 3.0), "the quaternion has norm"),
+    ],
+)
+def test_one_broken_pose_spoils_a_belief(change, reason):
+    message = belief_message(np.zeros((5, 3)), TimeBase().stamp(1.5), FRAME)
+    change(message.poses[3])
+    with pytest.raises(InvalidInputError, match=reason):
+        read_belief(message, FRAME)
 
 
 def test_contact_plans_round_trip_and_broken_ones_are_refused():

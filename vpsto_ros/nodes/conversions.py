@@ -207,7 +207,15 @@ def read_belief(message: PoseArray, frame: str) -> NDArray:
         InvalidInputError: wrong frame, broken quaternion or non-finite numbers.
     """
     require_frame(message.header, frame)
-    return np.array([read_pose(pose).pose for pose in message.poses]).reshape(-1, 3)
+    pairs = [(pose.position, pose.orientation) for pose in message.poses]
+    rows = [(p.x, p.y, p.z, q.x, q.y, q.z, q.w) for p, q in pairs]
+    x, y, z, i, j, k, w = np.array(rows).reshape(-1, 7).T
+    norm = np.sqrt(i * i + j * j + k * k + w * w)
+    fine = np.isfinite(x + y + z) & (np.abs(norm - 1.0) <= QUATERNION_TOLERANCE)
+    for index in np.flatnonzero(~fine):
+        read_pose(message.poses[index])  # says what is wrong
+    yaw = np.arctan2(2.0 * (w * k + i * j), w * w + i * i - j * j - k * k)
+    return np.stack([x, y, yaw], axis=1)
 
 
 # Contact plans

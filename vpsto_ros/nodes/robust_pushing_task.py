@@ -56,7 +56,7 @@ class RobustPushingTask:
         pose = None if known is None else known.belief.mean
         drawn = [
             make.shape("object", shape, pose, markers.ESTIMATE),
-            make.circles("predicted_spread", step.object_path[::4, :2], step.spread[::4], markers.PREDICTION),
+            make.circles("predicted_spread", step.object_path[::8, :2], step.spread[::8], markers.PREDICTION),
         ]
         if target is not None:
             drawn.append(make.shape("goal", shape, np.append(target.position, 0.0), markers.GOAL))
