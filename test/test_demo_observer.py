@@ -14,7 +14,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["ROS_DOMAIN_ID"] = str(random.SystemRandom().randrange(1, 100))
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -88,6 +88,18 @@ def test_the_last_reports_are_known(observer):
     assert observer.reported_since("mpc_planner", 7.0)
     assert not observer.reported_since("mpc_planner", 7.1)
     assert not observer.reported_since("franka_driver", 0.0)
+
+
+def test_a_planner_is_informed_once_it_has_heard_of_everything_but_the_goal(observer):
+    def report(**ages):
+        pairs = [KeyValue(key=f"age.{topic}_s", value=age) for topic, age in ages.items()]
+        message = DiagnosticArray(status=[DiagnosticStatus(name="mpc_planner", values=pairs)])
+        observer._receiver("/diagnostics")(serialize_message(message))
+        return observer.informed("mpc_planner")
+
+    assert not report()
+    assert not report(joint_states="0.010", object_belief="inf", contact_plan="inf")
+    assert report(joint_states="0.010", object_belief="0.030", contact_plan="inf")
 
 
 def test_a_failing_callback_ends_the_watch_with_its_error(observer, tmp_path):

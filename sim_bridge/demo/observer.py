@@ -89,6 +89,7 @@ class Observer(Node):
         self.simulated_time = 0.0
         self.first_plan: float | None = None
         self._reported: dict[str, float] = {}
+        self._informed: set[str] = set()
         self._goals = self.create_publisher(PoseStamped, GOAL_POSE, QoSProfile(depth=1))
         self._forces = self.create_publisher(WrenchStamped, DISTURBANCE, QoSProfile(depth=5))
         for topic, kind in TOPICS.items():
@@ -153,10 +154,18 @@ class Observer(Node):
         """Whether a node has published diagnostics at or after a simulated time [s]."""
         return self._reported.get(name, -math.inf) >= seconds
 
+    def informed(self, name: str) -> bool:
+        """Whether a node has said that it has got all of its inputs but the goal and what follows from it."""
+        return name in self._informed
+
     def _note_report(self, message: DiagnosticArray) -> None:
         stamp = message.header.stamp
         for status in message.status:
             self._reported[status.name] = stamp.sec + 1e-9 * stamp.nanosec
+            ages = {pair.key: pair.value for pair in status.values if pair.key.startswith("age.")}
+            ages.pop("age.contact_plan_s", None)  # comes after the first goal only
+            if ages and "inf" not in ages.values():
+                self._informed.add(status.name)
 
     def _act(self) -> None:
         message, joints = self.latest(GROUND_TRUTH), self.joints()

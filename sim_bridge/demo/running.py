@@ -148,8 +148,12 @@ def _wait_until_active(observer: Observer, spinning: Spinning, processes: Proces
     print("starting the nodes; the first time they compile for half a minute ...", flush=True)
     activity = Activity(observer, tuple(NODES))
     deadline = time.monotonic() + START_PATIENCE
+    # A planner that is told of a goal before it knows of the object would seem to miss its first cycles.
     while not (
-        activity.poll() and observer.subscribers_of_goal() >= 2 and observer.object_pose() is not None
+        activity.poll()
+        and observer.subscribers_of_goal() >= 2
+        and observer.object_pose() is not None
+        and observer.informed(PLANNER)
     ):
         spinning.check()
         for name in processes.ended():
