@@ -83,6 +83,14 @@ EXPERIMENTS = {
         "sim_bridge.experiments.robust_pushing.bimanual",
         "two arms push a can along a circle without sensors",
     ),
+    "single_hand": Choice(
+        "sim_bridge.experiments.robust_pushing.single_hand",
+        "a flat hand pushes a disc there and back without sensors",
+    ),
+    "bimanual_closed_loop": Choice(
+        "sim_bridge.experiments.robust_pushing.bimanual_closed_loop",
+        "two arms, a can that a hand moves away, robust or not",
+    ),
     "search": Choice(
         "sim_bridge.experiments.search.choices",
         "every option of the search against its alternatives",

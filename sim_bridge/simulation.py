@@ -230,7 +230,17 @@ class Simulation:
         move = _vector([dx, dy], "displacement", 2)
         if np.abs(move).max() > _DISPLACEMENT:
             raise InvalidInputError(f"the object is displaced by at most {_DISPLACEMENT} m, got ({dx}, {dy})")
-        self._object_q[:2] += move
+        self.place_object(self._object_q[:2] + move)
+
+    def place_object(self, position: ArrayLike) -> None:
+        """Put the object upright at a position (2,) [m] at once, at rest, as a hand does that lifts it over.
+
+        Raises:
+            InvalidInputError: the position is not two finite numbers.
+        """
+        yaw = self.object_pose()[2]
+        self._object_q[:2] = _vector(position, "position", 2)
+        self._object_q[2:] = (0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
         self._object_qd[:] = 0.0
         mujoco.mj_forward(self.model, self.data)
 

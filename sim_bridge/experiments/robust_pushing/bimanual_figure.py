@@ -24,7 +24,7 @@ def write(
     seed = min(seed for _, _, seed in plans)
     columns = [(v, r) for v in reversed(bimanual.VARIANTS) for r in (0.05, 0.03)]
     figure, grid = plt.subplots(
-        2, len(columns), figsize=(3.3 * len(columns), 7.4), layout="constrained", sharex=True, sharey=True
+        2, len(columns), figsize=(3.3 * len(columns), 5.6), layout="constrained", sharex=True, sharey=True
     )
     for (variant, radius), (above, below) in zip(columns, grid.T, strict=True):
         plan = plans[variant.name, radius, seed]

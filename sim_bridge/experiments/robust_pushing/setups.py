@@ -5,6 +5,7 @@ and where its mass is are the plant's; the friction model only knows ranges of t
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
 from vpsto_ros.planning.belief_space.contacts import ContactRule, CrossingRule
+from vpsto_ros.planning.belief_space.problem import Reach
 from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
 from vpsto_ros.planning.belief_space.spaces import PlaneSpace
 from vpsto_ros.robot.tip_kinematics import BALL_RADIUS, HAND_HALF_SIZE
@@ -27,7 +29,7 @@ FRICTION = (0.0, 0.6)
 CENTER_SHARE = 0.1
 """Standard deviation of the centre of friction that planners believe in, as a share of the radius."""
 
-DYNAMICS = {
+DYNAMICS: dict[str, dict[str, Any]] = {
     # The thesis's: frictionless contacts, 1 mm of noise per step in contact.
     "thesis": {"friction": False, "step_variance": 1e-6, "way_variance": 0.0},
     # Particles carry friction and a centre of friction; a push of 10 cm spreads by 3 mm in addition.
@@ -40,6 +42,12 @@ HAND = RobustPushingConfig(
     points=3, steps=60, executed=20, jitter=0.004, duration_weight=0.05, speed=0.15, acceleration=0.7,
     turn_speed=1.2, search=VpstoConfig(population=30, iterations=20, strategy="cma"),
 )  # fmt: skip
+
+STRAIGHT_HAND = dataclasses.replace(
+    HAND, contact_std=0.01, contact_yaw_std=0.01, smoothness_spread=0.02, duration_weight=0.0
+)
+"""The deterministic plan of the thesis is straight, the long side across. Left to itself the baseline swings
+the hand, which moves the object faster than the hand's speed limit and loses it in the first push."""
 
 
 def bimanual_effectors() -> EndEffectors:
@@ -66,7 +74,7 @@ def belief(place: NDArray, std: float, radius: float, count: int, rng: np.random
 
 def pusher(
     robot: str, radius: float, model: str, rng: np.random.Generator, *, robust: bool = True,
-    config: RobustPushingConfig | None = None,
+    config: RobustPushingConfig | None = None, reach: Reach | None = None,
 ) -> RobustPusher:  # fmt: skip
     """A planner for a robot of the simulation, "two_balls" or "hand", and a disc.
 
@@ -77,6 +85,7 @@ def pusher(
         rng: source of randomness.
         robust: False is the deterministic baseline.
         config: options instead of the usual ones for this robot.
+        reach: where the tools may be, instead of wherever the robot reaches.
     """
     two = robot == "two_balls"
     effectors = bimanual_effectors() if two else hand_effectors()
@@ -89,7 +98,7 @@ def pusher(
     )  # fmt: skip
     return RobustPusher(
         config, dynamics(radius, effectors, model), PlaneSpace(effectors, config), rule, rng,
-        reach=plane.contains,
+        reach=reach or plane.contains,
     )  # fmt: skip
 
 

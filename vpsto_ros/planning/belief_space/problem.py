@@ -110,18 +110,18 @@ class RobustPushingProblem:
             )  # fmt: skip
         if config.duration_weight > 0.0:
             cost += config.duration_weight * outcome.motion.duration
+        # Squeezing breaks the assumption of stiff arms (6.3.1), whether the variance matters or not.
         valid = (outcome.excess <= 0.0) & (prediction.step <= config.longest_step)
+        valid &= prediction.wedge >= config.wedge
         if config.robust:
             robustness_costs(
                 prediction.variance, prediction.contact, config.perturbation, robust, outcome.gain,
                 config.largest_gain,
             )  # fmt: skip
             valid &= outcome.gain <= config.largest_gain + GAIN_TOLERANCE
-            valid &= prediction.wedge >= config.wedge
         cost += robust
-        worst_valid = cost[valid].max(
-            initial=0.0
-        )  # those that move the object away cost more than any offset
+        # Valid ones that move the object away may cost more than any offset.
+        worst_valid = cost[valid].max(initial=0.0)
         penalty = np.where(valid, 0.0, INVALID_COST * (1.0 + outcome.excess) + worst_valid)
         return Evaluation(cost + penalty, valid)
 
