@@ -19,8 +19,8 @@ HEAVY = {
     "rclpy", "mujoco", "sim_bridge", "cma", "matplotlib", "viser", "rosbags", "joblib", "dask", "distributed",
 }  # fmt: skip
 ROOMS = (
-    "trajectory", "contact", "robot", "collision", "priors", "belief", "estimation", "optimization", "planning",
-    "nodes",
+    "trajectory", "contact", "robot", "collision", "priors", "belief", "estimation", "optimization",
+    "planning", "nodes",
 )  # fmt: skip
 """A room may import those before it, and the modules that belong to no room."""
 SHARED = {"configuration", "exceptions", "kernel_cache", "sources"}

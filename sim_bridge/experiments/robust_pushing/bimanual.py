@@ -351,7 +351,7 @@ def plan_table(plans: dict[tuple[str, float, int], PlanResult]) -> str:
 
 def run_table(tasks: list[RunTask], runs: list[RunResult]) -> str:
     """Runs on the arms by planner and plan."""
-    header = ["planner", "plan", "bottle", "can", "glass", "largest deviation", "largest final error"]
+    header = ["planner", "plan", *OBJECTS, "largest deviation", "largest final error"]
     rows = []
     for variant in VARIANTS:
         for plan in sorted({task.plan for task in tasks}):

@@ -101,20 +101,12 @@ def _place(rng: np.random.Generator) -> NDArray:
 
 
 def _clear(place: NDArray, tools: NDArray) -> NDArray:
-    """The place nearest to one (2,), mirrored or shifted, that the balls (4,) leave free."""
-    shifts = [np.array([dx, dy]) for dx in (0.0, 0.03, -0.03, 0.06, -0.06) for dy in (0.0, 0.04, -0.04)]
-    tried = [
-        mirror * (place - GOAL) + GOAL + shift for shift in shifts for mirror in ([1, 1], [1, -1], [-1, 1])
-    ]
-    for spot in tried:
-        apart = np.linalg.norm(tools.reshape(2, 2) - spot, axis=1).min()
-        if apart > RADIUS + BALL_RADIUS + 0.015 and np.hypot(*(spot - GOAL)) >= _LEAST_WAY and _inside(spot):
-            return spot
-    raise AssertionError("the goal's surroundings cannot all be taken by two balls")
-
-
-def _inside(place: NDArray) -> bool:
-    return bool(_START_X[0] <= place[0] <= _START_X[1] and _START_Y[0] <= place[1] <= _START_Y[1])
+    """The place nearest to one (2,), on a grid of 1 cm, that the balls (4,) leave free."""
+    x, y = np.meshgrid(np.arange(*_START_X, 0.01), np.arange(*_START_Y, 0.01))
+    spots = np.column_stack([x.ravel(), y.ravel()])
+    apart = np.linalg.norm(spots[:, None] - tools.reshape(2, 2), axis=2).min(axis=1)
+    free = (apart > RADIUS + BALL_RADIUS + 0.015) & (np.linalg.norm(spots - GOAL, axis=1) >= _LEAST_WAY)
+    return spots[free][np.linalg.norm(spots[free] - place, axis=1).argmin()]
 
 
 def _until_reached(loop: BimanualLoop) -> float:
