@@ -340,6 +340,28 @@ def test_valid_candidates_keep_every_constraint(velocity):
         assert outcome.prediction.step[b] <= config.longest_step
 
 
+@pytest.mark.parametrize("too_near", [2e-4, 0.003])
+def test_balls_that_stand_too_near_to_each_other_are_not_stuck(too_near):
+    """As where a brake ended: plans may begin there if they do not make it worse."""
+    apart = 2.0 * BALL + 0.005 - too_near
+    start = [0.40, apart / 2.0, 0.40, -apart / 2.0]
+    posed = problem(start=start)
+    points = posed.prior().sample(np.random.default_rng(7), 400)
+    evaluation, paths = posed.evaluate(points), posed.outcome(points).paths
+    assert 0 < evaluation.valid.sum() < 400
+    excess = [separation_numpy(BALLS, path, posed.config.separation, 0.05, 0.12) for path in paths]
+    assert max(np.array(excess)[evaluation.valid]) <= too_near + 2e-6
+
+
+def test_arms_that_stand_out_of_reach_come_back():
+    posed = problem(start=[0.53, 0.10, 0.40, -0.10], reach=in_reach)  # the left ball is outside
+    points = posed.prior().sample(np.random.default_rng(7), 400)
+    ends = np.array([in_reach(path[-1:, :2])[0] for path in posed.outcome(points).paths])
+    assert ends.any() and not ends.all()
+    assert (posed.outcome(points).excess[ends] < 0.1).all()
+    assert (posed.outcome(points).excess[~ends] >= 0.1).all()
+
+
 @pytest.mark.parametrize(
     "options",
     [{}, {"progress_weight": 1e4}, {"distance_weight": 1e4}, {"robust": False}, {"duration_weight": 1e3}],

@@ -24,6 +24,9 @@ from vpsto_ros.trajectory import OptimalBasis, Trajectory, TrajectoryBatch, synt
 INVALID_COST = 1e3
 """Offset that ranks every candidate with a broken constraint behind all others, as lambda_c of eq. (6.33)."""
 
+ROUND_OFF = 1e-6
+"""Violations that differ by less are the same [m, rad]."""
+
 Reach = Callable[[NDArray], NDArray]
 """Whether plane coordinates (K, m) are within reach, shape (K,) of bool."""
 
@@ -91,6 +94,7 @@ class RobustPushingProblem:
         self.basis, self.contact = OptimalBasis.uniform(config.points - 1), contact or self._contact()
         crossing = rule.crossing
         self._arms = (0.0, math.inf) if crossing is None else (crossing.offset, crossing.crossing)
+        self._leeway = self._leeways()
 
     def evaluate(self, points: NDArray) -> Evaluation:
         """Costs and validity of candidates (B, N, n): c_task + c_robust, (6.54) and (6.32)."""
@@ -133,30 +137,47 @@ class RobustPushingProblem:
             config.steps + 1, derivatives=False,
         )  # fmt: skip
         paths, heights = self.space.plane(motion.position)
-        prediction = self.dynamics.predict(self.belief, paths)
-        excess = np.empty(len(points))
-        scoring.separation_excess(
-            self.dynamics.effectors.rows, paths, config.separation, *self._arms, excess,
-        )  # fmt: skip
-        self._add_robot_limits(motion, paths, heights, excess)
+        prediction, excess = self.dynamics.predict(self.belief, paths), np.zeros(len(points))
+        violations = self._violations(motion.position, paths, heights)
+        for worst, leeway in zip(violations, self._leeway, strict=True):
+            np.maximum(excess, worst - leeway, out=excess)
+        if heights is None and self.reach is not None:
+            inside = self.reach(paths.reshape(-1, paths.shape[2])).reshape(paths.shape[:2])
+            # Arms that are out of reach now, as where a brake ended, have to come back.
+            share = inside.mean(axis=1) if inside[0, 0] else inside[:, -1]
+            np.maximum(excess, 0.1 * (1.0 - share), out=excess)
         return HorizonOutcome(motion, paths, prediction, np.full(len(points), np.nan), excess)
 
-    def _add_robot_limits(
-        self, motion: TrajectoryBatch, paths: NDArray, heights: NDArray | None, excess: NDArray
-    ) -> None:
-        """Add what leaves the reach of the arms, position limits or the tools' height."""
-        limits = self.space.limits
+    def _violations(self, positions: NDArray, paths: NDArray, heights: NDArray | None) -> list[NDArray]:
+        """How far each constraint on the robot is broken at worst, shape (B,) for each.
+
+        Args:
+            positions: in the search space, shape (B, K, n).
+            paths: plane coordinates, shape (B, K, m).
+            heights: of the tools, shape (B, K, E), if any.
+        """
+        batch, limits = len(paths), self.space.limits
+        separation = np.empty(batch)
+        scoring.separation_excess(
+            self.dynamics.effectors.rows, paths, self.config.separation, *self._arms, separation
+        )
+        found = [separation]
         if limits.lower is not None and limits.upper is not None:
-            beyond = np.maximum(limits.lower - motion.position, motion.position - limits.upper)
-            np.maximum(excess, beyond.max(axis=(1, 2)), out=excess)
+            found.append(np.maximum(limits.lower - positions, positions - limits.upper).max(axis=(1, 2)))
         if heights is not None:
-            worst = np.empty(len(paths))
-            height = self.space.height  # type: ignore[attr-defined]
-            scoring.height_excess(heights, height, self.config.height_tolerance, worst)
-            np.maximum(excess, worst, out=excess)
-        elif self.reach is not None:
-            inside = self.reach(paths.reshape(-1, paths.shape[2])).reshape(paths.shape[:2])
-            np.maximum(excess, 0.1 * (1.0 - inside.mean(axis=1)), out=excess)
+            height, off = self.space.height, np.empty(batch)  # type: ignore[attr-defined]
+            scoring.height_excess(heights, height, self.config.height_tolerance, off)
+            found.append(off)
+        return found
+
+    def _leeways(self) -> list[float]:
+        """By how much each constraint is broken now, as where a brake ended: it must not become worse.
+
+        Without, a robot that stands a hair beyond a constraint would never find a valid motion again.
+        """
+        here = np.asarray(self.start)[None, None]
+        now = [float(worst[0]) for worst in self._violations(here, *self.space.plane(here))]
+        return [worst + ROUND_OFF if worst > 0.0 else 0.0 for worst in now]
 
     def prior(self) -> GaussianPrior:
         """Product of the smoothness prior and the contact prior, eq. (6.49)."""
