@@ -78,8 +78,9 @@ def read_effector_contact(
         raise InvalidInputError(f"no end effector {tool!r} (child_frame_id); this robot has {names}")
     size = len(_columns(effectors)[tool_frames.index(tool)])
     mean = read_pose(message.pose.pose).pose[:size]
-    covariance = read_planar_covariance(message.pose.covariance)[:size, :size]
-    if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() <= 0.0:
+    given = read_planar_covariance(message.pose.covariance)[:size, :size]
+    covariance = 0.5 * (given + given.T)  # what rounding leaves of asymmetry would stop the planner
+    if not np.allclose(given, covariance) or np.linalg.eigvalsh(covariance).min() <= 0.0:
         raise InvalidInputError(f"the covariance of {tool!r} is not positive definite")
     return EffectorContact(tool, time_base.seconds(message.header.stamp), mean, covariance)
 

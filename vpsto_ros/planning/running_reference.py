@@ -26,7 +26,8 @@ class MpcStep:
         trajectory: joint trajectory in absolute time, to replace what is being executed, or None when there
             is nothing to execute. It begins
             with what is left of the running one until the new plan takes over and ends at rest.
-        mode: "explore", "warm_start", "stop" (no via-points), "hold" (goal reached), "brake" (no valid plan),
+        mode: "explore", "warm_start", "stop" (no via-points), "robust", "deterministic" (what robust pushing
+            plans), "hold" (goal reached), "brake" (no valid plan),
             "enter" (on
             the way into the plane), "wait" (not ready).
         valid: whether it is a plan that works, as opposed to a safe stop.

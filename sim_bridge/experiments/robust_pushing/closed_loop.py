@@ -74,7 +74,7 @@ class BimanualLoop:
         believed = dynamics(radius, effectors, "friction")
         options = ParticleFilterConfig(friction=FRICTION, center_std=CENTER_SHARE * radius)
         self.filter = ObjectParticleFilter(options, believed, np.random.default_rng([seed, 6]))
-        model = believed if config.planning.robust else dynamics(radius, effectors, "thesis")
+        model = dynamics(radius, effectors, "thesis")
         rule = ContactRule(
             effectors, PlanarShape.disc(radius), config.planning.contact_angle,
             config.planning.contact_advance, CrossingRule(),

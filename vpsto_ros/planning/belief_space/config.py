@@ -122,6 +122,10 @@ class RobustPushingConfig:
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.executed > self.steps:
+            raise ConfigurationError(
+                f"executed = {self.executed} is more than a horizon of steps = {self.steps} has"
+            )
 
 
 @documented
@@ -145,6 +149,13 @@ class RobustMpcConfig:
         unit="m",
         minimum=1e-4,
         maximum=0.5,
+    )
+    hold_std: float = option(
+        0.02,
+        "and the belief's standard deviation is at most",
+        unit="m",
+        minimum=1e-4,
+        maximum=1.0,
     )
     largest_std: float = option(
         0.06,

@@ -45,7 +45,6 @@ class RobustPushingMpc(ReferencePlanner):
         config: options; with ``planning.robust = False`` it is the deterministic controller of 6.6.4.
         pusher: plans single horizons.
         tools: the plane of the tools.
-        prediction: what the last search predicts of the belief, None if there was none.
     """
 
     def __init__(
@@ -82,9 +81,8 @@ class RobustPushingMpc(ReferencePlanner):
     def reset(self) -> None:
         """Forget everything about the running motion, as after a restart of the robot's driver."""
         super().reset()
-        self.holding, self._progress = False, 0.0
+        self.holding, self._progress, self._tool_offset = False, 0.0, np.zeros(self.tools.dof)
         self._target: Target | None = None
-        self.prediction: NDArray = np.zeros((0, 2))
 
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
@@ -130,13 +128,15 @@ class RobustPushingMpc(ReferencePlanner):
         problem = self._reason_to_stop(now, belief, target)
         if problem or belief is None or target is None:
             return self._stop(now, "brake", problem)
+        self._observe_offset(now, joint_position)
         ahead = self._carried(belief, now + self.config.lead)
         if self._reached(target, ahead):
             return self._stop(now, "hold", "the object is at its goal", valid=True)
         position, velocity = self._tools_at(now + self.config.lead)
         horizon = self.pusher.horizon(
             position, velocity, ahead, target.way(self._progress), start_time=now + self.config.lead,
-            previous=self._plane, contact=contact, deadline=deadline, clock=clock,
+            previous=self._plane, contact=contact, tool_offset=self._tool_offset, deadline=deadline,
+            clock=clock,
         )  # fmt: skip
         if not horizon.valid:
             return self._stop(now, "brake", "no valid plan found")
@@ -205,18 +205,27 @@ class RobustPushingMpc(ReferencePlanner):
         begin = max(min(belief.stamp, when), self._running.start_time)
         count = max(2, int(np.ceil((when - begin) / _BELIEF_STEP)) + 1)
         times = np.minimum(np.linspace(begin, when, count), self._running.end_time)
-        return self._carried_along(belief.belief, self.tools.tool(self._running(times)))
+        return self._carried_along(belief.belief, self.tools.tool(self._running(times)) + self._tool_offset)
+
+    def _observe_offset(self, now: float, joint_position: NDArray) -> None:
+        """Low-pass the offset of the tools from their reference: under load the arms lag by millimetres."""
+        offset = self.tools.tool(joint_position) - self.tools.tool(self._running(now))
+        self._tool_offset = self._tool_offset + 0.3 * (offset - self._tool_offset)
 
     def _carried_along(self, belief: ObjectBelief, path: NDArray) -> ObjectBelief:
         return self.pusher.dynamics.simulate(belief, path, self.rng).belief
 
     def _reached(self, target: Target, belief: ObjectBelief) -> bool:
-        """Hysteresis: rest within the hold distance until the object is beyond the resume distance."""
+        """Hysteresis: rest within the hold distance until the object is beyond the resume distance.
+
+        A belief that is too wide is not at its goal, wherever its mean is.
+        """
         if target is not self._target:
             self._target, self._progress, self.holding = target, 0.0, False
         self._progress = target.advanced(self._progress, belief.mean[:2])
         left = target.remaining(self._progress, belief.mean[:2])
-        self.holding = left <= (self.config.resume_distance if self.holding else self.config.hold_distance)
+        within = self.config.resume_distance if self.holding else self.config.hold_distance
+        self.holding = left <= within and belief.variance <= self.config.hold_std**2
         return self.holding
 
     def _tools_at(self, when: float) -> tuple[NDArray, NDArray]:
@@ -236,10 +245,10 @@ class RobustPushingMpc(ReferencePlanner):
         assert result.points is not None
         outcome = horizon.problem.outcome(result.points[None])
         path = outcome.prediction.mean[0]
-        self.prediction = np.column_stack([path[:, :2], np.zeros(len(path))])
         return MpcStep(
             self._joined(now, followed.trajectory), _MODES[self.config.planning.robust], True, "pushing",
-            result.cost, outcome.paths[0], self.prediction, result.iterations,
+            result.cost, outcome.paths[0], np.column_stack([path[:, :2], np.zeros(len(path))]),
+            result.iterations,
             plane if followed.stretch == 1.0 else None, spread=np.sqrt(outcome.prediction.variance[0]),
         )  # fmt: skip
 

@@ -26,6 +26,8 @@ INVALID_COST = 1e3
 
 ROUND_OFF = 1e-6
 """Violations that differ by less are the same [m, rad]."""
+LARGEST_LEEWAY = 3e-3
+"""How far a constraint may be broken at the start of a horizon [m, rad]."""
 
 Reach = Callable[[NDArray], NDArray]
 """Whether plane coordinates (K, m) are within reach, shape (K,) of bool."""
@@ -70,6 +72,7 @@ class RobustPushingProblem:
         reach: Reach | None = None,
         start_time: float = 0.0,
         contact: tuple[NDArray, NDArray] | None = None,
+        tool_offset: NDArray | float = 0.0,
     ) -> None:
         """Pose the problem.
 
@@ -86,6 +89,8 @@ class RobustPushingProblem:
             start_time: time of the start [s].
             contact: mean (m,) and covariance (m, m) of the plane coordinates in contact, (6.38), as somebody
                 else plans them; None: by the rule.
+            tool_offset: where the end effectors are relative to their plane coordinates, shape (m,): under
+                load an impedance-controlled arm lags.
         """
         self.config, self.dynamics, self.space, self.rule = config, dynamics, space, rule
         self.start, self.velocity, self.start_time = start, velocity, start_time
@@ -94,7 +99,7 @@ class RobustPushingProblem:
         self.basis, self.contact = OptimalBasis.uniform(config.points - 1), contact or self._contact()
         crossing = rule.crossing
         self._arms = (0.0, math.inf) if crossing is None else (crossing.offset, crossing.crossing)
-        self._leeway = self._leeways()
+        self._leeway, self._tool_offset = self._leeways(), tool_offset
 
     def evaluate(self, points: NDArray) -> Evaluation:
         """Costs and validity of candidates (B, N, n): c_task + c_robust, (6.54) and (6.32)."""
@@ -137,7 +142,8 @@ class RobustPushingProblem:
             config.steps + 1, derivatives=False,
         )  # fmt: skip
         paths, heights = self.space.plane(motion.position)
-        prediction, excess = self.dynamics.predict(self.belief, paths), np.zeros(len(points))
+        prediction = self.dynamics.predict(self.belief, paths + self._tool_offset)
+        excess = np.zeros(len(points))
         violations = self._violations(motion.position, paths, heights)
         for worst, leeway in zip(violations, self._leeway, strict=True):
             np.maximum(excess, worst - leeway, out=excess)
@@ -173,11 +179,12 @@ class RobustPushingProblem:
     def _leeways(self) -> list[float]:
         """By how much each constraint is broken now, as where a brake ended: it must not become worse.
 
-        Without, a robot that stands a hair beyond a constraint would never find a valid motion again.
+        Without, a robot that stands a hair beyond a constraint would never find a valid motion again. More
+        than a hair is not forgiven: a leeway for crossed arms must not let the tools collide.
         """
         here = np.asarray(self.start)[None, None]
         now = [float(worst[0]) for worst in self._violations(here, *self.space.plane(here))]
-        return [worst + ROUND_OFF if worst > 0.0 else 0.0 for worst in now]
+        return [min(worst, LARGEST_LEEWAY) + ROUND_OFF if worst > 0.0 else 0.0 for worst in now]
 
     def prior(self) -> GaussianPrior:
         """Product of the smoothness prior and the contact prior, eq. (6.49)."""

@@ -29,6 +29,8 @@ MAX_HORIZONS = 500
 STILL = 1e-9
 """Speed below which there is nothing to brake, in units of the search space per second: round-off."""
 
+_STEP_TIME = 0.02  # of a brake before any horizon was valid [s]
+
 
 @dataclasses.dataclass(frozen=True)
 class Horizon:
@@ -97,6 +99,7 @@ class RobustPusher:
         """Set up the planner; see :class:`RobustPushingProblem` for the arguments."""
         self.config, self.dynamics, self.space, self.rule = config, dynamics, space, rule
         self.rng, self.reach = rng, reach
+        self._step_time = _STEP_TIME
         self._quiet = dataclasses.replace(dynamics, friction=False, step_variance=0.0, way_variance=0.0)
 
     def horizon(
@@ -109,6 +112,7 @@ class RobustPusher:
         start_time: float = 0.0,
         previous: Trajectory | None = None,
         contact: tuple[NDArray, NDArray] | None = None,
+        tool_offset: NDArray | float = 0.0,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> Horizon:
@@ -122,6 +126,7 @@ class RobustPusher:
             start_time: when the horizon begins [s].
             previous: what was planned before; what is left of it is one more candidate.
             contact: where to touch, see :class:`RobustPushingProblem`.
+            tool_offset: of the end effectors, see :class:`RobustPushingProblem`.
             deadline: value of `clock` by which to be back.
             clock: reads the time.
         """
@@ -129,7 +134,7 @@ class RobustPusher:
         problem = RobustPushingProblem(
             config, self.dynamics, self.space, self.rule, start=start, velocity=velocity,
             belief=self._planning_belief(belief, start), way=way, reach=self.reach, start_time=start_time,
-            contact=contact,
+            contact=contact, tool_offset=tool_offset,
         )  # fmt: skip
         result = search(
             problem.prior(), problem.evaluate, config.search, self.rng,
@@ -137,6 +142,7 @@ class RobustPusher:
         )  # fmt: skip
         if result.points is not None:
             motion = problem.trajectory(result.points)
+            self._step_time = motion.duration / config.steps
             return Horizon(motion, True, motion.duration * config.executed / config.steps, result, problem)
         brake = braking_trajectory(start, velocity, self.space.limits, start_time=start_time)
         return Horizon(brake, False, brake.duration, result, problem)
@@ -215,8 +221,11 @@ class RobustPusher:
         return self._quiet.simulate(jittered, np.stack([here, here]), self.rng).belief
 
     def _path(self, motion: Trajectory, begin: float, end: float) -> NDArray:
-        """Plane coordinates between two times, as finely as the steps of a horizon."""
-        steps = max(2, round(self.config.steps * (end - begin) / max(motion.duration, 1e-6)))
+        """Plane coordinates between two times, as finely as the steps of the last horizon that was valid.
+
+        Noise per step ties the spread of a rollout to the length of its steps: brakes have no other ones.
+        """
+        steps = max(1, round((end - begin) / self._step_time))
         times = np.linspace(begin, min(end, motion.end_time), steps + 1)
         return self.space.plane(motion(times)[None])[0][0]
 
