@@ -81,15 +81,15 @@ EXPERIMENTS = {
     ),
     "bimanual": Choice(
         "sim_bridge.experiments.robust_pushing.bimanual",
-        "two arms push a can along a circle without sensors",
+        "two arms push a can along a circle, blind",
     ),
     "single_hand": Choice(
         "sim_bridge.experiments.robust_pushing.single_hand",
-        "a flat hand pushes a disc there and back without sensors",
+        "a flat hand pushes a disc there and back, blind",
     ),
     "bimanual_closed_loop": Choice(
         "sim_bridge.experiments.robust_pushing.bimanual_closed_loop",
-        "two arms, a can that a hand moves away, robust or not",
+        "two arms, a can moved by hand, robust or not",
     ),
     "search": Choice(
         "sim_bridge.experiments.search.choices",
@@ -101,11 +101,11 @@ EXPERIMENTS = {
     ),
     "variance_gain": Choice(
         "sim_bridge.experiments.belief.variance_gain",
-        "variance of a disc pushed by one finger, a side, two fingers",
+        "variance of a disc pushed by one finger, a side, two",
     ),
     "contact_prior": Choice(
         "sim_bridge.experiments.belief.contact_prior",
-        "candidates that touch, with the contact prior and without",
+        "candidates that touch, with a contact prior and without",
     ),
     "robust_push_2d": Choice(
         "sim_bridge.experiments.belief.robust_push_2d",
