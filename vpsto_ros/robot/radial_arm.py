@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from vpsto_ros.robot import kinematics as fr3
+import vpsto_ros.robot.kinematics as fr3
 
 # Link lengths of the planar arm: shoulder to elbow joint, elbow joint to wrist; the elbow is offset from
 # both link axes.
