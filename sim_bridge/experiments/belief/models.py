@@ -22,8 +22,6 @@ class Model:
         friction: whether particles carry friction in 0..0.5 and a centre of friction, std 0.1 radii.
         step_variance: variance of the perturbation per step in contact [m^2].
         way_variance: variance of the perturbation per metre that the object is pushed [m].
-        largest_gain: variance gain that a plan may have; more than 1 where no push keeps to the thesis's
-            bound.
     """
 
     name: str
@@ -31,7 +29,6 @@ class Model:
     friction: bool
     step_variance: float
     way_variance: float
-    largest_gain: float = 1.0
 
     def dynamics(self, radius: float, effectors: EndEffectors) -> BeliefDynamics:
         """Of a disc among end effectors."""
