@@ -50,19 +50,28 @@ class RobustContactPlanner:
         way = target.way(progress)[-1, :2] - belief.mean[:2]
         length = math.hypot(*way)
         along = way / length if length > 1e-6 else np.array([1.0, 0.0])
-        mean, covariance = contact_distribution(
-            rule.configuration(belief.mean, along, present), rule.jacobian(), belief.covariance,
-            np.diag(self._stds() ** 2),
-        )  # fmt: skip
+        mean, covariance = likely_contact(config, rule, belief, present, along)
         ways = rule.effectors.poses(mean)[:, :2] - rule.effectors.poses(present)[:, :2]
         arrival = now + float(np.hypot(*ways.T).max()) / config.speed
         return RobustContactPlan(arrival, mean, covariance, config.speed * along)
 
-    def _stds(self) -> NDArray:
-        """How exactly each plane coordinate is meant."""
-        effectors, config = self.rule.effectors, self.config
-        stds = np.full(effectors.dof, config.contact_std)
-        for column, turns in zip(effectors.columns, effectors.rows[:, 5] > 0.0, strict=True):
-            if turns:
-                stds[column + 2] = config.contact_yaw_std
-        return stds
+
+def likely_contact(
+    config: RobustPushingConfig, rule: ContactRule, belief: ObjectBelief, present: NDArray, along: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Mean (m,) and covariance (m, m) of the plane coordinates in contact, eq. (6.38).
+
+    Args:
+        config: how exactly contacts are meant.
+        rule: where to touch an object whose place is known.
+        belief: over the object.
+        present: plane coordinates of the end effectors, shape (m,).
+        along: unit vector of the push, shape (2,).
+    """
+    effectors = rule.effectors
+    stds = np.full(effectors.dof, config.contact_std)
+    for column, turns in zip(effectors.columns, effectors.rows[:, 5] > 0.0, strict=True):
+        if turns:
+            stds[column + 2] = config.contact_yaw_std
+    contact = rule.configuration(belief.mean, along, present)
+    return contact_distribution(contact, rule.jacobian(), belief.covariance, np.diag(stds**2))

@@ -14,9 +14,9 @@ from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.planning.belief_space import scoring
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
+from vpsto_ros.planning.belief_space.contact_plan import likely_contact
 from vpsto_ros.planning.belief_space.contacts import ContactRule
 from vpsto_ros.planning.belief_space.spaces import SearchSpace
-from vpsto_ros.priors.contact import contact_distribution
 from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.trajectory import OptimalBasis, Trajectory, TrajectoryBatch, synthesize, synthesize_batch
@@ -214,18 +214,7 @@ class RobustPushingProblem:
 
     def _contact(self) -> tuple[NDArray, NDArray]:
         """Where to touch, eq. (6.38)."""
-        contact = self.rule.configuration(self.belief.mean, self._direction(), self.present)
-        return contact_distribution(
-            contact, self.rule.jacobian(), self.belief.covariance, self._contact_covariance()
-        )
-
-    def _contact_covariance(self) -> NDArray:
-        effectors, config = self.dynamics.effectors, self.config
-        std = np.full(effectors.dof, config.contact_std)
-        for column, turns in zip(effectors.columns, effectors.rows[:, 5] > 0.0, strict=True):
-            if turns:
-                std[column + 2] = config.contact_yaw_std
-        return np.diag(std**2)
+        return likely_contact(self.config, self.rule, self.belief, self.present, self._direction())
 
     def _keys(self, points: NDArray) -> NDArray:
         start = np.broadcast_to(self.start, (len(points), 1, points.shape[2]))
