@@ -37,7 +37,7 @@ from vpsto_ros.nodes.robots import BeliefModelConfig, RobotConfig, contact_rule
 from vpsto_ros.nodes.scene import ModelConfig, ShapeConfig
 from vpsto_ros.nodes.state_estimator import StateEstimator
 from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
-from vpsto_ros.planning.belief_space.config import RobustPushingConfig
+from vpsto_ros.planning.belief_space.config import RobustMpcConfig, RobustPushingConfig
 from vpsto_ros.planning.belief_space.contact_plan import RobustContactPlan
 from vpsto_ros.planning.goal import PlanarGoal
 from vpsto_ros.robot.bimanual_plane import BimanualPlane
@@ -268,7 +268,7 @@ def test_both_tools_are_told_where_to_touch(contacts):
     left, right = (plan.mean for plan in read)
     assert left[1] > 0.02 and right[1] < -0.02 and max(left[0], right[0]) < PLACE[0]
     # Eq. (6.38): how exactly to touch, and how uncertain the object is.
-    expected = RobustPushingConfig().contact_std ** 2 + 0.01**2
+    expected = RobustMpcConfig().planning.contact_std ** 2 + 0.01**2
     assert np.trace(read[0].covariance) / 2 == pytest.approx(expected, rel=0.15)
     assert messages[-1].twist.twist.linear.x > 0.05
     names = {marker.ns for m in contacts.received["contact_planner/markers"] for marker in m.markers}
@@ -287,7 +287,9 @@ def test_both_tools_are_told_where_to_touch(contacts):
 
 @pytest.fixture
 def planner(bench):
-    made = bench(MpcPlannerNode, "mpc_planner", **ROBUST)
+    # Slow tools: within a test they do not reach an object that its beliefs leave standing.
+    slow = {"robust.planning.speed": 0.12, "robust.planning.acceleration": 0.6}
+    made = bench(MpcPlannerNode, "mpc_planner", **ROBUST, **slow)
     made.node.deadline = 60.0  # simulated time stands while it plans; a busy host must not change the plans
     for kind, topic in (
         (JointState, "joint_states"),
@@ -407,7 +409,7 @@ def test_a_bad_belief_is_refused_with_a_reason_and_harms_nothing(planner, messag
     [
         ({"place": np.array([0.8, 0.0, 0.0])}, "outside the workspace"),
         ({"std": 0.1}, "the object is lost"),
-        ({"age": 0.49}, None),
+        ({"age": 0.45}, None),
         ({"age": 0.8}, "s old"),
     ],
 )

@@ -170,12 +170,13 @@ def test_every_target_of_the_hand_can_be_missed(name, value):
     [
         ("median_time_ratio", 0.9), ("median_time_ratio_ci95", [0.7, 1.05]), ("late_cycles", 0.1),
         ("reached", {"robust": [150, 180]}), ("arm_contacts", 2), ("limit_violations", 2),
+        ("rejected", 1),
     ],
 )  # fmt: skip
 def test_every_target_of_the_closed_loop_can_be_missed(name, value):
     good = {
         "median_time_ratio": 0.8, "median_time_ratio_ci95": [0.7, 0.9], "late_cycles": 0.0, "rate_hz": 20.0,
-        "reached": {"robust": [180, 180]}, "arm_contacts": 0, "limit_violations": 0,
+        "reached": {"robust": [180, 180]}, "arm_contacts": 0, "limit_violations": 0, "rejected": 0,
     }  # fmt: skip
     assert bimanual_closed_loop.missed_targets(good) == []
     assert len(bimanual_closed_loop.missed_targets({**good, name: value})) == 1

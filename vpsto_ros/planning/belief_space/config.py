@@ -51,7 +51,8 @@ class RobustPushingConfig:
     duration_weight: float = option(0.0, "cost of a second of motion", unit="1/s", minimum=0.0, maximum=1e3)
     wedge: float = option(
         -0.5,
-        "a plan is invalid when the normals of two contacts have a smaller product: it squeezes the object",
+        "a plan is invalid when the normals of two contacts have a smaller product: it squeezes the object, "
+        "which friction mu holds fast below -(1 - mu^2) / (1 + mu^2), -0.47 for 0.6",
         minimum=-1.0,
         maximum=1.0,
     )
@@ -171,6 +172,13 @@ class RobustMpcConfig:
         minimum=1e-3,
         maximum=1.0,
     )
+    largest_offset: float = option(
+        0.01,
+        "the arms let go when a tool is held farther off its reference: the object is squeezed or stuck",
+        unit="m",
+        minimum=1e-3,
+        maximum=0.1,
+    )
     object_timeout: float = option(
         0.5, "the arms stop when the belief is older", unit="s", minimum=0.02, maximum=10.0
     )
@@ -182,7 +190,16 @@ class RobustMpcConfig:
     )
     planning: RobustPushingConfig = dataclasses.field(
         default_factory=lambda: RobustPushingConfig(
-            search=VpstoConfig(population=30, iterations=10, strategy="cma")
+            perturbation=1e-5,
+            largest_gain=1.02,
+            progress_weight=90.0,
+            duration_weight=0.15,
+            contact_std=0.02,
+            contact_advance=0.02,
+            speed=0.2,
+            acceleration=1.0,
+            wedge=-0.3,
+            search=VpstoConfig(population=30, iterations=10, strategy="cma"),
         )
     )
 

@@ -23,7 +23,7 @@ from vpsto_ros.planning.plane_path import follow_plane
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import resting
 from vpsto_ros.robot.tool_plane import ToolPlane
-from vpsto_ros.trajectory import Trajectory, braking_trajectory
+from vpsto_ros.trajectory import OptimalBasis, Trajectory, braking_trajectory, synthesize
 
 _BELIEF_STEP = 0.02  # time between samples of the reference when a belief is carried on [s]
 _KNOTS = 0.06  # between knots of a joint trajectory [s]: within a micrometre of the plane's motion
@@ -128,7 +128,9 @@ class RobustPushingMpc(ReferencePlanner):
         problem = self._reason_to_stop(now, belief, target)
         if problem or belief is None or target is None:
             return self._stop(now, "brake", problem)
-        self._observe_offset(now, joint_position)
+        pressed = self._observe_offset(now, joint_position)
+        if np.abs(pressed).max() > self.config.largest_offset:
+            return self._let_go(now, pressed)
         ahead = self._carried(belief, now + self.config.lead)
         if self._reached(target, ahead):
             return self._stop(now, "hold", "the object is at its goal", valid=True)
@@ -207,10 +209,11 @@ class RobustPushingMpc(ReferencePlanner):
         times = np.minimum(np.linspace(begin, when, count), self._running.end_time)
         return self._carried_along(belief.belief, self.tools.tool(self._running(times)) + self._tool_offset)
 
-    def _observe_offset(self, now: float, joint_position: NDArray) -> None:
-        """Low-pass the offset of the tools from their reference: under load the arms lag by millimetres."""
+    def _observe_offset(self, now: float, joint_position: NDArray) -> NDArray:
+        """Offset of the tools from their reference, (m,), noted low-passed: under load arms lag a little."""
         offset = self.tools.tool(joint_position) - self.tools.tool(self._running(now))
         self._tool_offset = self._tool_offset + 0.3 * (offset - self._tool_offset)
+        return offset
 
     def _carried_along(self, belief: ObjectBelief, path: NDArray) -> ObjectBelief:
         return self.pusher.dynamics.simulate(belief, path, self.rng).belief
@@ -251,6 +254,27 @@ class RobustPushingMpc(ReferencePlanner):
             result.iterations,
             plane if followed.stretch == 1.0 else None, spread=np.sqrt(outcome.prediction.variance[0]),
         )  # fmt: skip
+
+    def _let_go(self, now: float, offset: NDArray) -> MpcStep:
+        """Bring the reference to where the tools are, so that they do not press any more.
+
+        An object that two tools squeeze, or that is stuck, does not move as predicted; a reference that goes
+        on would only press harder.
+        """
+        takeover = now + self.config.lead
+        position, velocity = self._tools_at(takeover)
+        back = synthesize(
+            OptimalBasis.uniform(0), np.stack([position, self.tools.tool(self._running(now)) + offset]),
+            velocity, np.zeros_like(position), self.pusher.space.limits, start_time=takeover,
+        )  # fmt: skip
+        message = f"the tools are held {1e3 * np.abs(offset).max():.0f} mm off their reference; letting go"
+        try:
+            followed = follow_plane(back, self.tools, spacing=_KNOTS, cubic=True)
+        except InfeasibleError:
+            return self._stop(now, "brake", message)
+        if followed.stretch > 1.0 and np.abs(velocity).max() > 1e-6:
+            return self._stop(now, "brake", message)
+        return MpcStep(self._joined(now, followed.trajectory), "brake", False, message)
 
     def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
         """Come to rest in the plane at constant deceleration."""
