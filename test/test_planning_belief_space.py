@@ -16,8 +16,9 @@ from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space import scoring
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
 from vpsto_ros.planning.belief_space.contacts import ContactRule, CrossingRule
+from vpsto_ros.planning.belief_space.plan_choice import best_plan
 from vpsto_ros.planning.belief_space.problem import INVALID_COST, RobustPushingProblem, require_free
-from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
+from vpsto_ros.planning.belief_space.receding_horizon import RobustPlan, RobustPusher
 from vpsto_ros.planning.belief_space.spaces import JointSpace, PlaneSpace
 from vpsto_ros.planning.belief_space.targets import WAY_POINTS, GoalTarget, PathTarget
 from vpsto_ros.robot.bimanual_plane import LEAST_DISTANCE, WORKSPACE, BimanualPlane
@@ -665,3 +666,40 @@ def test_a_contact_out_of_reach_of_an_arm():
     beyond = np.array([1.2, 0.2, 1.2, -0.2])
     with pytest.raises(InfeasibleError, match="cannot reach"):
         planner.space.factor(2, beyond + 0.1, np.eye(4) * 1e-4, beyond)
+
+
+# Choosing among plans
+
+
+def plan_with(reached, horizons):
+    still = belief(0.001)
+    nothing = np.zeros(1)
+    return RobustPlan(None, reached, horizons, 0, still, nothing, nothing, nothing, 1.0, 0.0, 0)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "enough", "chosen", "made"),
+    [
+        ([(True, 0.5), (True, 0.99), (True, 0.7)], math.inf, 1, 3),
+        ([(True, 0.5), (True, 0.99), (True, 0.7)], 0.9, 1, 2),
+        ([(False, 1.0), (True, 0.1)], 0.9, 1, 2),
+        ([(False, 0.2), (False, 0.3)], 0.0, 1, 2),
+        ([(True, 0.9), (True, 0.9)], math.inf, 0, 2),
+    ],
+)  # fmt: skip
+def test_the_best_plan_that_gets_there_is_taken(outcomes, enough, chosen, made):
+    made_plans = []
+
+    def make():
+        made_plans.append(plan_with(outcomes[len(made_plans)][0], len(made_plans)))
+        return made_plans[-1]
+
+    plan, verdict = best_plan(
+        make, lambda plan: outcomes[plan.horizons], lambda verdict: verdict[1], len(outcomes), enough=enough
+    )
+    assert plan is made_plans[chosen] and verdict == outcomes[chosen] and len(made_plans) == made
+
+
+def test_at_least_one_plan_has_to_be_made():
+    with pytest.raises(InvalidInputError, match="attempts = 0"):
+        best_plan(lambda: plan_with(True, 0), lambda plan: 0.0, float, 0)

@@ -39,7 +39,8 @@ from sim_bridge.experiments.runs import (
 from sim_bridge.robots import KINDS
 from sim_bridge.scene import HandStart, Scene
 from sim_bridge.simulation import Simulation
-from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
+from vpsto_ros.planning.belief_space.plan_choice import best_plan
+from vpsto_ros.planning.belief_space.receding_horizon import RobustPlan
 from vpsto_ros.planning.belief_space.targets import GoalTarget
 from vpsto_ros.robot.tool_plane import ToolPlane
 from vpsto_ros.trajectory import Trajectory
@@ -132,23 +133,29 @@ def make_plan(task: PlanTask) -> PlanResult:
     rng = np.random.default_rng([task.seed, 3])
     config, model = (HAND, "friction") if task.robust else (STRAIGHT_HAND, "thesis")
     planner = pusher("hand", RADIUS, model, rng, robust=task.robust, config=config, reach=reach_both_ways)
+
+    def make() -> RobustPlan:
+        believed = belief(BEGIN, PLACE_STD, RADIUS, planner.config.particles, rng)
+        return planner.plan(HAND_START, believed, GoalTarget(END, TOLERANCE, LARGEST_STD))
+
     begin = time.thread_time()
-    plans = [_plan_once(planner, rng) for _ in range(ATTEMPTS if task.robust else 1)]
-    best = min(plans, key=lambda plan: plan.worst if plan.reached else np.inf)
-    return dataclasses.replace(best, seconds=time.thread_time() - begin)
+    plan, errors = best_plan(
+        make, lambda plan: rehearse(plan, rng), lambda errors: -float(errors.max()),
+        ATTEMPTS if task.robust else 1,
+    )  # fmt: skip
+    assert plan.trajectory is not None, "the disc does not begin at its goal"
+    near, worst = float(np.mean(errors < 0.02)), float(errors.max())
+    return PlanResult(plan.trajectory, plan.reached, time.thread_time() - begin, near, worst)
 
 
-def _plan_once(planner: RobustPusher, rng: np.random.Generator) -> PlanResult:
-    believed = belief(BEGIN, PLACE_STD, RADIUS, planner.config.particles, rng)
-    plan = planner.plan(HAND_START, believed, GoalTarget(END, TOLERANCE, LARGEST_STD))
+def rehearse(plan: RobustPlan, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Distance from the goal at the end of noisy rollouts, (ROLLOUTS,) [m]."""
     motion = plan.trajectory
     assert motion is not None, "the disc does not begin at its goal"
     times = np.linspace(motion.start_time, motion.end_time, int(motion.duration / 0.02) + 2)
     judged = make_dynamics(RADIUS, hand_effectors(), "friction")
     final = judged.simulate(belief(BEGIN, PLACE_STD, RADIUS, ROLLOUTS, rng), motion(times), rng).belief
-    errors = np.linalg.norm(final.poses[:, :2] - END, axis=1)
-    near, worst = float(np.mean(errors < 0.02)), float(errors.max())
-    return PlanResult(motion, plan.reached, plan.seconds, near, worst)
+    return np.linalg.norm(final.poses[:, :2] - END, axis=1)
 
 
 def reach_both_ways(points: NDArray) -> NDArray[np.bool_]:
