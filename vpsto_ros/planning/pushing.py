@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.contact.pushing import PushingModel, rollout
 from vpsto_ros.estimation.object_state import ObjectState
@@ -54,7 +54,7 @@ class PushingMpc(ReferencePlanner):
         the joint trajectory is then slower than the plane motion (see :class:`TablePath`), and the step's
         message says so.
         """
-        super().__init__(robot, config.lead, config.joint_tolerance, config.object_timeout)
+        super().__init__(robot, 2, config.lead, config.joint_tolerance, config.object_timeout)
         self.config, self.model = config, model
         table_map = TableMap(robot, config.tool_height)
         _check_workspace(config, table_map)
@@ -68,7 +68,6 @@ class PushingMpc(ReferencePlanner):
     def reset(self) -> None:
         """Forget everything about the running motion, as after a restart of the robot's driver."""
         super().reset()
-        self.tool_offset = np.zeros(2)
         self.holding = False
 
     def forget_plan(self) -> None:
@@ -180,10 +179,8 @@ class PushingMpc(ReferencePlanner):
             return MpcStep(None, "wait", False, str(error))
         return MpcStep(motion, "enter", False, "moving the tool into its plane", ready_at=motion.end_time)
 
-    def _observe_offset(self, now: float, joint_position: NDArray) -> None:
-        """Low-pass the offset of the tool from its reference: under load the arm lags by millimetres."""
-        offset = self.table_map.tool(joint_position) - self.table_map.tool(self._running(now))
-        self.tool_offset = self.tool_offset + 0.3 * (offset - self.tool_offset)
+    def _tool(self, q: ArrayLike) -> NDArray[np.float64]:
+        return self.table_map.tool(q)
 
     def _reason_to_stop(self, now: float, state: ObjectState | None, goal: PlanarGoal | None) -> str:
         if goal is None:
@@ -262,23 +259,11 @@ class PushingMpc(ReferencePlanner):
             plane if stretch < 1.05 else None,
         )  # fmt: skip
 
-    def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
-        """Come to rest gently: straight in the plane, at constant deceleration (N = 0 with a free end)."""
-        takeover = now + self.config.lead
-        position, velocity, _ = self._running.state(takeover)
-        if np.abs(velocity).max() < 1e-6:
-            return MpcStep(
-                self._joined(now, resting(position, takeover, takeover + 0.5)), mode, valid, message
-            )
-        tool = self.table_map.tool(position)
-        plane = braking_trajectory(
-            tool, self.table_map.tool_velocity(position, velocity), self.limits, start_time=takeover
-        )
-        try:
-            joints = self.table_path.joints(plane, position, velocity)
-        except InfeasibleError:
-            joints = braking_trajectory(position, velocity, self.robot.limits, start_time=takeover)
-        return MpcStep(self._joined(now, joints), mode, valid, message)
+    def _brake(self, takeover: float, position: NDArray, velocity: NDArray) -> Trajectory:
+        """Straight in the plane (N = 0 with a free end)."""
+        tool, tool_velocity = self.table_map.tool(position), self.table_map.tool_velocity(position, velocity)
+        plane = braking_trajectory(tool, tool_velocity, self.limits, start_time=takeover)
+        return self.table_path.joints(plane, position, velocity)
 
 
 def _check_workspace(config: PushingMpcConfig, table_map: TableMap) -> None:

@@ -4,18 +4,20 @@ A new plan takes over a moment after planning began; until then the arm goes on 
 published trajectory begins with what is left of it.
 """
 
+import abc
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.exceptions import VpstoError
-from vpsto_ros.planning.stitching import extended
+from vpsto_ros.exceptions import InfeasibleError, VpstoError
+from vpsto_ros.planning.stitching import extended, resting
 from vpsto_ros.robot.kinematics import Robot
 from vpsto_ros.trajectory import Trajectory, braking_trajectory
 
 AT_REST = 0.02
 """Joint speed below which the arm counts as standing [rad/s]."""
+_OFFSET_GAIN = 0.3  # of the low-pass of the tools' offset, per cycle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,29 +56,53 @@ class MpcStep:
     spread: NDArray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
 
-class ReferencePlanner:
-    """Keeps the reference that is being followed, joins new motions to it, and stops it."""
+class ReferencePlanner(abc.ABC):
+    """Keeps the reference that is being followed, joins new motions to it, and stops it.
 
-    def __init__(self, robot: Robot, lead: float, joint_tolerance: float, memory: float) -> None:
+    Attributes:
+        robot: the arm.
+        reference: what is being followed, None before anything is.
+        ready_at: nothing is planned before this time [s].
+        tool_offset: where the tools are relative to their reference in plane coordinates, low-passed, (m,).
+    """
+
+    def __init__(self, robot: Robot, dof: int, lead: float, joint_tolerance: float, memory: float) -> None:
         """Nothing is being followed yet.
 
         Args:
             robot: the arm.
+            dof: number of plane coordinates m.
             lead: time between the start of planning and the moment a plan takes over [s].
             joint_tolerance: how far a joint may be from its reference [rad].
             memory: how far back the reference is kept [s].
         """
         self.robot = robot
+        self._dof = dof
         self._lead, self._joint_tolerance, self._memory = lead, joint_tolerance, memory
         self.reference: Trajectory | None = None
         self.ready_at = -np.inf
+        self.tool_offset = np.zeros(dof)
+
+    @abc.abstractmethod
+    def _tool(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Plane coordinates (..., m) of the tools for joint positions (..., n)."""
+
+    @abc.abstractmethod
+    def _brake(self, takeover: float, position: NDArray, velocity: NDArray) -> Trajectory:
+        """From a joint state on: to rest in the plane, at constant deceleration.
+
+        Raises:
+            InfeasibleError: the joints cannot follow.
+        """
 
     def reset(self) -> None:
         """Forget everything about the running motion, as after a restart of the robot's driver."""
         self.reference = None
         self.ready_at = -np.inf
+        self.tool_offset = np.zeros(self._dof)
         self.forget_plan()
 
+    @abc.abstractmethod
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
 
@@ -111,6 +137,25 @@ class ReferencePlanner:
 
     def _reference_moves(self, now: float) -> bool:
         return self.reference is not None and np.abs(self.reference(now + self._lead, 1)).max() > 1e-6
+
+    def _observe_offset(self, now: float, joint_position: NDArray) -> NDArray:
+        """Offset of the tools from their reference, (m,), noted low-passed: under load arms lag a little."""
+        offset = self._tool(joint_position) - self._tool(self._running(now))
+        self.tool_offset = self.tool_offset + _OFFSET_GAIN * (offset - self.tool_offset)
+        return offset
+
+    def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
+        """Come to rest: in the plane, or as fast as the joints can where that is infeasible."""
+        takeover = now + self._lead
+        position, velocity, _ = self._running.state(takeover)
+        if np.abs(velocity).max() < 1e-6:
+            joints = resting(position, takeover, takeover + 0.5)
+        else:
+            try:
+                joints = self._brake(takeover, position, velocity)
+            except InfeasibleError:
+                joints = braking_trajectory(position, velocity, self.robot.limits, start_time=takeover)
+        return MpcStep(self._joined(now, joints), mode, valid, message)
 
     def _with_past(self, trajectory: Trajectory) -> Trajectory:
         """A trajectory preceded by what was executed before it, as far back as an object state may date."""

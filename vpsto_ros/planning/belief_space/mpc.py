@@ -5,11 +5,12 @@ until the new one takes over; what is left of it is a candidate of the new searc
 """
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.belief.particles import ObjectBelief
@@ -27,6 +28,7 @@ from vpsto_ros.trajectory import OptimalBasis, Trajectory, braking_trajectory, s
 
 _BELIEF_STEP = 0.02  # time between samples of the reference when a belief is carried on [s]
 _KNOTS = 0.06  # between knots of a joint trajectory [s]: within a micrometre of the plane's motion
+_REACH_MARGIN = 0.003  # by which searched motions stay within reach: so that brakes do, too [m]
 _MODES = {True: "robust", False: "deterministic"}
 
 
@@ -67,7 +69,7 @@ class RobustPushingMpc(ReferencePlanner):
         Raises:
             ConfigurationError: end effectors and tools do not fit together.
         """
-        super().__init__(tools.robot, config.lead, config.joint_tolerance, config.object_timeout)
+        super().__init__(tools.robot, tools.dof, config.lead, config.joint_tolerance, config.object_timeout)
         if dynamics.effectors.dof != tools.dof:
             raise ConfigurationError(
                 f"the end effectors have {dynamics.effectors.dof} plane coordinates, the robot's tools "
@@ -75,13 +77,14 @@ class RobustPushingMpc(ReferencePlanner):
             )
         space = PlaneSpace(dynamics.effectors, config.planning)
         self.config, self.tools, self.rng = config, tools, rng
-        self.pusher = RobustPusher(config.planning, dynamics, space, rule, rng, reach=tools.contains)
+        reach = functools.partial(tools.contains, margin=_REACH_MARGIN)
+        self.pusher = RobustPusher(config.planning, dynamics, space, rule, rng, reach=reach)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything about the running motion, as after a restart of the robot's driver."""
         super().reset()
-        self.holding, self._progress, self._tool_offset = False, 0.0, np.zeros(self.tools.dof)
+        self.holding, self._progress = False, 0.0
         self._target: Target | None = None
 
     def forget_plan(self) -> None:
@@ -137,7 +140,7 @@ class RobustPushingMpc(ReferencePlanner):
         position, velocity = self._tools_at(now + self.config.lead)
         horizon = self.pusher.horizon(
             position, velocity, ahead, target.way(self._progress), start_time=now + self.config.lead,
-            previous=self._plane, contact=contact, tool_offset=self._tool_offset, deadline=deadline,
+            previous=self._plane, contact=contact, tool_offset=self.tool_offset, deadline=deadline,
             clock=clock,
         )  # fmt: skip
         if not horizon.valid:
@@ -207,13 +210,10 @@ class RobustPushingMpc(ReferencePlanner):
         begin = max(min(belief.stamp, when), self._running.start_time)
         count = max(2, int(np.ceil((when - begin) / _BELIEF_STEP)) + 1)
         times = np.minimum(np.linspace(begin, when, count), self._running.end_time)
-        return self._carried_along(belief.belief, self.tools.tool(self._running(times)) + self._tool_offset)
+        return self._carried_along(belief.belief, self.tools.tool(self._running(times)) + self.tool_offset)
 
-    def _observe_offset(self, now: float, joint_position: NDArray) -> NDArray:
-        """Offset of the tools from their reference, (m,), noted low-passed: under load arms lag a little."""
-        offset = self.tools.tool(joint_position) - self.tools.tool(self._running(now))
-        self._tool_offset = self._tool_offset + 0.3 * (offset - self._tool_offset)
-        return offset
+    def _tool(self, q: ArrayLike) -> NDArray[np.float64]:
+        return self.tools.tool(q)
 
     def _carried_along(self, belief: ObjectBelief, path: NDArray) -> ObjectBelief:
         return self.pusher.dynamics.simulate(belief, path, self.rng).belief
@@ -234,9 +234,12 @@ class RobustPushingMpc(ReferencePlanner):
     def _tools_at(self, when: float) -> tuple[NDArray, NDArray]:
         """Plane coordinates and their rates of the reference, within the planner's limits."""
         position, velocity, _ = self._running.state(when)
+        return self.tools.tool(position), self._rates(position, velocity)
+
+    def _rates(self, position: NDArray, velocity: NDArray) -> NDArray:
+        """Of the plane coordinates (m,) in a joint state, cut to the planner's limits."""
         most = self.pusher.space.limits.velocity
-        rates = np.clip(self.tools.tool_velocity(position, velocity), -most, most)
-        return self.tools.tool(position), rates
+        return np.clip(self.tools.tool_velocity(position, velocity), -most, most)
 
     def _joint_step(self, now: float, horizon: Horizon) -> MpcStep:
         plane, start = horizon.trajectory, horizon.trajectory.start_time
@@ -276,19 +279,10 @@ class RobustPushingMpc(ReferencePlanner):
             return self._stop(now, "brake", message)
         return MpcStep(self._joined(now, followed.trajectory), "brake", False, message)
 
-    def _stop(self, now: float, mode: str, message: str, *, valid: bool = False) -> MpcStep:
-        """Come to rest in the plane at constant deceleration."""
-        takeover = now + self.config.lead
-        position, velocity, _ = self._running.state(takeover)
-        if np.abs(velocity).max() < 1e-6:
-            rest = resting(position, takeover, takeover + 0.5)
-            return MpcStep(self._joined(now, rest), mode, valid, message)
-        brake = braking_trajectory(*self._tools_at(takeover), self.pusher.space.limits, start_time=takeover)
-        try:
-            followed = follow_plane(brake, self.tools, spacing=_KNOTS, cubic=True)
-            joints = followed.trajectory
-            if followed.stretch > 1.0:
-                raise InfeasibleError("slower")
-        except InfeasibleError:
-            joints = braking_trajectory(position, velocity, self.robot.limits, start_time=takeover)
-        return MpcStep(self._joined(now, joints), mode, valid, message)
+    def _brake(self, takeover: float, position: NDArray, velocity: NDArray) -> Trajectory:
+        state = self.tools.tool(position), self._rates(position, velocity)
+        brake = braking_trajectory(*state, self.pusher.space.limits, start_time=takeover)
+        followed = follow_plane(brake, self.tools, spacing=_KNOTS, cubic=True)
+        if followed.stretch > 1.0:
+            raise InfeasibleError(f"the joints would brake {followed.stretch:.2f} times slower")
+        return followed.trajectory
