@@ -119,6 +119,31 @@ def test_contact_prior_command(tmp_path):
     assert status in (0, 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("plane_with", {"mean": 0.89, "interval": [0.85, 0.93]}),
+        ("plane_without", {"mean": 0.45, "interval": [0.42, 0.47]}),
+        ("joints_with", {"mean": 0.4, "interval": [0.35, 0.45]}),
+        ("joints_without", {"mean": 0.3, "interval": [0.25, 0.35]}),
+    ],
+)
+def test_every_target_of_the_contact_prior_can_be_missed(name, value):
+    good = {
+        "plane_with": {"mean": 0.92, "interval": [0.9, 0.94]},
+        "plane_without": {"mean": 0.3, "interval": [0.25, 0.35]},
+        "joints_with": {"mean": 0.7, "interval": [0.65, 0.75]},
+        "joints_without": {"mean": 0.2, "interval": [0.15, 0.25]},
+    }
+
+    def missed(touch):
+        shares = {key: {"touch": row} for key, row in touch.items()}
+        return contact_prior.missed_targets({"shares": shares})
+
+    assert missed(good) == []
+    assert len(missed({**good, name: value})) == 1
+
+
 def test_robust_push_2d_command(tmp_path, monkeypatch):
     monkeypatch.setattr(robust_push_2d, "HORIZONS", 60)
     status, summary = experiment("robust_push_2d", tmp_path, "--runs", "1", "--seed", "1000")
@@ -129,6 +154,13 @@ def test_robust_push_2d_command(tmp_path, monkeypatch):
     assert len(list(tmp_path.glob("*.png"))) == len(MODELS)
 
 
+@pytest.mark.parametrize(("name", "value"), [("single_horizon_success", 0.94), ("receding_success", 0.98)])
+def test_every_target_of_the_push_into_a_region_can_be_missed(name, value):
+    good = {"single_horizon_success": 0.96, "receding_success": 0.995}
+    assert robust_push_2d.missed_targets(good) == []
+    assert len(robust_push_2d.missed_targets({**good, name: value})) == 1
+
+
 def test_ablation_command(tmp_path, monkeypatch):
     monkeypatch.setattr(belief_ablation, "ITERATIONS", (4, 10))
     monkeypatch.setattr(belief_ablation, "HORIZONS", 80)
@@ -137,6 +169,13 @@ def test_ablation_command(tmp_path, monkeypatch):
     assert summary["dof14_best"] > 0.5 and summary["dof14_best_m"] in (4, 10)
     assert status in (0, 1)
     assert set(summary["curves"]) == set(belief_ablation.CURVES)
+
+
+@pytest.mark.parametrize(("name", "value"), [("prior_m4", 0.96), ("no_prior_m4", 0.6), ("dof14_best", 0.94)])
+def test_every_target_of_the_ablation_can_be_missed(name, value):
+    good = {"prior_m4": 1.0, "no_prior_m4": 0.1, "dof14_best": 0.96, "dof14_best_m": 8}
+    assert belief_ablation.missed_targets(good) == []
+    assert len(belief_ablation.missed_targets({**good, name: value})) == 1
 
 
 def test_a_plan_that_falls_short_is_not_rolled_out():

@@ -1,33 +1,27 @@
 """Two balls on two arms push a disc of 5 cm along a circle (6.6.3): what experiments and bench share."""
 
-import functools
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.experiments.belief.models import Model, disc_belief
+from sim_bridge.experiments.belief.planners import robot_pusher, tool_plane
 from vpsto_ros.belief.particles import ObjectBelief
-from vpsto_ros.contact.end_effectors import EndEffectors
-from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
-from vpsto_ros.planning.belief_space.contacts import ContactRule, CrossingRule
 from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
-from vpsto_ros.planning.belief_space.spaces import JointSpace, PlaneSpace, SearchSpace
 from vpsto_ros.planning.belief_space.targets import PathTarget
-from vpsto_ros.robot.bimanual_plane import BimanualPlane
-from vpsto_ros.robot.kinematics import fr3_bimanual
+from vpsto_ros.robot.kinds import TOOL_KINDS
+from vpsto_ros.robot.tool_plane import ToolPlane
 
-RADIUS, BALL_RADIUS, STD = 0.05, 0.03, 0.007
+RADIUS, STD = 0.05, 0.007
 OBJECT, CENTRE = (0.42, 0.0), (0.52, 0.0)
-BALLS = EndEffectors.discs(BALL_RADIUS, 2)
+BALLS = TOOL_KINDS["two_balls"].effectors
 START = np.array([0.34, 0.10, 0.34, -0.10])
 TARGET = PathTarget.circle(OBJECT, CENTRE)
 
 
-@functools.cache
-def arms() -> BimanualPlane:
+def arms() -> ToolPlane:
     """Both arms; loading their model takes a moment."""
-    return BimanualPlane(fr3_bimanual())
+    return tool_plane("two_balls")
 
 
 def belief(count: int, rng: np.random.Generator) -> ObjectBelief:
@@ -39,12 +33,7 @@ def pusher(
     config: RobustPushingConfig, model: Model, *, joints: bool, rng: np.random.Generator
 ) -> RobustPusher:
     """The planner, in the plane of the balls (4 coordinates) or in the 14 joints."""
-    plane = arms()
-    space: SearchSpace = JointSpace(plane, config) if joints else PlaneSpace(BALLS, config)
-    rule = ContactRule(
-        BALLS, PlanarShape.disc(RADIUS), config.contact_angle, config.contact_advance, CrossingRule()
-    )
-    return RobustPusher(config, model.dynamics(RADIUS, BALLS), space, rule, rng, reach=plane.contains)
+    return robot_pusher("two_balls", RADIUS, model, config, rng, joints=joints)
 
 
 def start(joints: bool, point: NDArray = START) -> NDArray:

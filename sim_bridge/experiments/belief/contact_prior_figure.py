@@ -76,7 +76,8 @@ def _candidates(axes: Any, problem: Any, rng: np.random.Generator, norm: Any) ->
 def _surroundings(axes: Any, problem: Any, informed: bool) -> None:
     from matplotlib.patches import Circle, Ellipse
 
-    from sim_bridge.experiments.belief.bimanual import BALL_RADIUS, RADIUS
+    from sim_bridge.experiments.belief.bimanual import RADIUS
+    from vpsto_ros.robot.tip_kinematics import BALL_RADIUS
 
     belief = problem.belief
     for x, y, _ in belief.poses:

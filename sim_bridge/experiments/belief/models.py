@@ -1,4 +1,4 @@
-"""The two belief models that all experiments of this room compare, and the disc they push."""
+"""The two belief models that experiments compare, and what is believed of the disc they push."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,6 +11,11 @@ from vpsto_ros.belief.particles import ObjectBelief
 from vpsto_ros.contact.end_effectors import EndEffectors
 from vpsto_ros.contact.geometry import PlanarShape
 
+FRICTION_RANGE = (0.0, 0.6)
+"""What is believed of the friction between tools and disc unless an experiment says otherwise."""
+CENTER_SHARE = 0.1
+"""Standard deviation of the centre of friction that is believed in, as a share of the radius."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Model:
@@ -19,7 +24,7 @@ class Model:
     Attributes:
         name: short.
         title: for tables and figures.
-        friction: whether particles carry friction in 0..0.5 and a centre of friction, std 0.1 radii.
+        friction: whether the friction and the centre of friction of the particles act.
         step_variance: variance of the perturbation per step in contact [m^2].
         way_variance: variance of the perturbation per metre that the object is pushed [m].
     """
@@ -39,13 +44,16 @@ class Model:
 
 
 THESIS = Model("thesis", "frictionless, noise per step (thesis)", False, 1e-6, 0.0)
+"""Frictionless contacts, 1 mm of noise per step in contact."""
 FRICTION = Model("friction", "particles carry friction, noise per way", True, 0.0, 1e-4)
+"""Particles carry friction and a centre of friction; a push of 10 cm spreads by 3 mm in addition."""
 MODELS = {model.name: model for model in (THESIS, FRICTION)}
 
 
 def disc_belief(
-    center: ArrayLike, std: ArrayLike, radius: float, count: int, rng: np.random.Generator
-) -> ObjectBelief:
+    center: ArrayLike, std: ArrayLike, radius: float, count: int, rng: np.random.Generator, *,
+    friction: tuple[float, float] = FRICTION_RANGE,
+) -> ObjectBelief:  # fmt: skip
     """A Gaussian belief over a disc; both models get the same one, the frictionless one ignores the friction.
 
     Args:
@@ -54,9 +62,11 @@ def disc_belief(
         radius: of the disc [m].
         count: number of particles.
         rng: source of randomness.
+        friction: range of the friction between tools and disc.
     """
     pose, spread = [*np.asarray(center, dtype=float), 0.0], [*np.broadcast_to(std, 2), 0.0]
-    return ObjectBelief.gaussian(pose, spread, count, rng, friction=(0.0, 0.5), center_std=0.1 * radius)
+    center_std = CENTER_SHARE * radius
+    return ObjectBelief.gaussian(pose, spread, count, rng, friction=friction, center_std=center_std)
 
 
 def mean_interval(values: Sequence[float] | NDArray, seed: int = 0) -> tuple[float, float]:

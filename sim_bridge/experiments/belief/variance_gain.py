@@ -32,6 +32,8 @@ RADIUS, STD, ADVANCE = 0.04, 0.008, 0.006
 PERTURBATION = 4e-6
 """V_w: perturbations of 2 mm."""
 PARTICLES, FEW, DRAWS = 4000, 20, 20
+TOOL_FRICTION = (0.0, 0.5)
+"""Range of the friction that particles carry."""
 FINGER = 0.015
 ALLOWED = 3.0
 
@@ -98,7 +100,7 @@ def measure(seed: int) -> dict[tuple[str, str], Gains]:
 
 def belief(count: int, rng: np.random.Generator) -> ObjectBelief:
     """Particles at x = 0, Gaussian across the push."""
-    return disc_belief((0.0, 0.0), (0.0, STD), RADIUS, count, rng)
+    return disc_belief((0.0, 0.0), (0.0, STD), RADIUS, count, rng, friction=TOOL_FRICTION)
 
 
 def gains(push: Push, model: Model, rng: np.random.Generator) -> Gains:

@@ -15,15 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.experiments.belief.models import MODELS, disc_belief
 from sim_bridge.experiments.robust_pushing.playback import play
-from sim_bridge.experiments.robust_pushing.setups import (
-    DYNAMICS,
-    belief,
-    bimanual_effectors,
-    dynamics,
-    pusher,
-    random_plant,
-)
+from sim_bridge.experiments.robust_pushing.setups import pusher, random_plant
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
@@ -39,6 +33,7 @@ from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.planning.belief_space.plan_choice import best_plan
 from vpsto_ros.planning.belief_space.receding_horizon import RobustPlan
 from vpsto_ros.planning.belief_space.targets import PathTarget
+from vpsto_ros.robot.kinds import TOOL_KINDS
 from vpsto_ros.trajectory import Trajectory
 
 START = np.array([0.42, 0.0])
@@ -123,7 +118,7 @@ def make_plan(task: PlanTask) -> PlanResult:
     def make() -> RobustPlan:
         begin = time.thread_time()
         plan = planner.plan(
-            BALLS, belief(START, PLACE_STD, task.radius, planner.config.particles, rng), target()
+            BALLS, disc_belief(START, PLACE_STD, task.radius, planner.config.particles, rng), target()
         )
         seconds.append(time.thread_time() - begin)
         return plan
@@ -131,12 +126,10 @@ def make_plan(task: PlanTask) -> PlanResult:
     def rehearse(plan: RobustPlan) -> dict[str, tuple[float, NDArray]]:
         assert plan.trajectory is not None, "the start is not the end of the path"
         # The baseline is judged from the expected place, as in the thesis.
-        std = PLACE_STD if variant.robust else 0.0
+        std, effectors = PLACE_STD if variant.robust else 0.0, TOOL_KINDS["two_balls"].effectors
         return {
-            name: roll_out(
-                dynamics(task.radius, bimanual_effectors(), name), plan.trajectory, std, task.radius, rng
-            )
-            for name in DYNAMICS
+            name: roll_out(model.dynamics(task.radius, effectors), plan.trajectory, std, task.radius, rng)
+            for name, model in MODELS.items()
         }
 
     plan, rolled = best_plan(
@@ -155,7 +148,7 @@ def roll_out(
 ) -> tuple[float, NDArray]:
     """Share of successful noisy rollouts, and some paths (R, 200, 2)."""
     times = np.linspace(motion.start_time, motion.end_time, int(motion.duration / STEP) + 2)
-    rollout = model.simulate(belief(START, std, radius, ROLLOUTS, rng), motion(times), rng, stride=10)
+    rollout = model.simulate(disc_belief(START, std, radius, ROLLOUTS, rng), motion(times), rng, stride=10)
     good = succeeded(rollout.poses[..., :2])
     return float(good.mean()), rollout.poses[:, :200, :2]
 
@@ -265,7 +258,7 @@ def warm_up() -> None:
     for variant in VARIANTS:
         rng = np.random.default_rng(0)
         planner = pusher("two_balls", 0.05, variant.model, rng, robust=variant.robust)
-        planner.plan(BALLS, belief(START, PLACE_STD, 0.05, 20, rng), target(), horizons=2)
+        planner.plan(BALLS, disc_belief(START, PLACE_STD, 0.05, 20, rng), target(), horizons=2)
 
 
 def report(
@@ -363,7 +356,7 @@ def plan_table(plans: dict[tuple[str, float, int], PlanResult]) -> str:
             own = [p.success[variant.model] for p in mine]
             rows.append([
                 variant.title, f"{100 * radius:.0f} cm", f"{sum(p.reached for p in mine)} of {len(mine)}",
-                *(f"{100 * np.mean([p.success[model] for p in mine]):.1f} %" for model in DYNAMICS),
+                *(f"{100 * np.mean([p.success[model] for p in mine]):.1f} %" for model in MODELS),
                 f"{100 * min(own):.1f} %", f"{np.median([p.motion.duration for p in mine]):.0f} s",
                 f"{np.mean([p.attempts for p in mine]):.2f}", f"{np.median([p.seconds for p in mine]):.2f} s",
                 f"{100 * sum(p.violating for p in mine) / sum(p.horizons for p in mine):.1f} %",

@@ -11,26 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.camera import CameraConfig
-from sim_bridge.experiments.robust_pushing.setups import (
-    CENTER_SHARE,
-    FRICTION,
-    PLANE_HEIGHT,
-    bimanual_effectors,
-    dynamics,
-    random_plant,
-)
-from sim_bridge.robots import KINDS
+from sim_bridge.experiments.belief.models import CENTER_SHARE, FRICTION, FRICTION_RANGE, THESIS
+from sim_bridge.experiments.belief.planners import contact_rule, tool_plane
+from sim_bridge.experiments.robust_pushing.setups import random_plant
 from sim_bridge.scene import BallsStart, Scene
 from sim_bridge.simulation import Simulation
 from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
-from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
 from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
 from vpsto_ros.planning.belief_space.config import RobustMpcConfig
-from vpsto_ros.planning.belief_space.contacts import ContactRule, CrossingRule
 from vpsto_ros.planning.belief_space.mpc import RobustPushingMpc, StampedBelief
 from vpsto_ros.planning.belief_space.targets import GoalTarget
 from vpsto_ros.planning.running_reference import MpcStep
+from vpsto_ros.robot.kinds import TOOL_KINDS
 
 PERIOD, TRANSPORT = 0.05, 0.03
 """Time between two plans, and until the arms get one [s]."""
@@ -69,16 +62,12 @@ class BimanualLoop:
             plant=plant, robot="two_balls", object_pose=(*start.tolist(), 0.0), balls=BallsStart(start=BALLS)
         )
         self.simulation = Simulation(scene, seed=seed, camera=CAMERA)
-        kind, effectors = KINDS["two_balls"], bimanual_effectors()
-        tools = kind.plane(kind.load(), PLANE_HEIGHT["two_balls"])
-        believed = dynamics(radius, effectors, "friction")
-        options = ParticleFilterConfig(friction=FRICTION, center_std=CENTER_SHARE * radius)
+        tools, effectors = tool_plane("two_balls"), TOOL_KINDS["two_balls"].effectors
+        believed = FRICTION.dynamics(radius, effectors)
+        options = ParticleFilterConfig(friction=FRICTION_RANGE, center_std=CENTER_SHARE * radius)
         self.filter = ObjectParticleFilter(options, believed, np.random.default_rng([seed, 6]))
-        model = dynamics(radius, effectors, "thesis")
-        rule = ContactRule(
-            effectors, PlanarShape.disc(radius), config.planning.contact_angle,
-            config.planning.contact_advance, CrossingRule(),
-        )  # fmt: skip
+        model = THESIS.dynamics(radius, effectors)
+        rule = contact_rule("two_balls", radius, config.planning)
         self.planner = RobustPushingMpc(config, model, tools, rule, np.random.default_rng([seed, 7]))
         self.planner.warm_up()
         self.target, self.recording = GoalTarget(goal), Recording()

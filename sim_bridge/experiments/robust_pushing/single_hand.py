@@ -9,7 +9,6 @@ best of five by its own noisy rollouts; the baseline, which knows of no noise, h
 
 import argparse
 import dataclasses
-import functools
 import pathlib
 import time
 from typing import Any
@@ -17,17 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.experiments.belief.models import FRICTION, disc_belief
+from sim_bridge.experiments.belief.planners import tool_plane
 from sim_bridge.experiments.robust_pushing.playback import play
-from sim_bridge.experiments.robust_pushing.setups import (
-    HAND,
-    PLANE_HEIGHT,
-    STRAIGHT_HAND,
-    belief,
-    hand_effectors,
-    pusher,
-    random_plant,
-)
-from sim_bridge.experiments.robust_pushing.setups import dynamics as make_dynamics
+from sim_bridge.experiments.robust_pushing.setups import HAND, STRAIGHT_HAND, pusher, random_plant
 from sim_bridge.experiments.robust_pushing.there_and_back import ThereAndBack
 from sim_bridge.experiments.runs import (
     Execution,
@@ -36,13 +28,12 @@ from sim_bridge.experiments.runs import (
     run_trials,
     write_summary,
 )
-from sim_bridge.robots import KINDS
 from sim_bridge.scene import HandStart, Scene
 from sim_bridge.simulation import Simulation
 from vpsto_ros.planning.belief_space.plan_choice import best_plan
 from vpsto_ros.planning.belief_space.receding_horizon import RobustPlan
 from vpsto_ros.planning.belief_space.targets import GoalTarget
-from vpsto_ros.robot.tool_plane import ToolPlane
+from vpsto_ros.robot.kinds import TOOL_KINDS
 from vpsto_ros.trajectory import Trajectory
 
 RADIUS = 0.05
@@ -135,7 +126,7 @@ def make_plan(task: PlanTask) -> PlanResult:
     planner = pusher("hand", RADIUS, model, rng, robust=task.robust, config=config, reach=reach_both_ways)
 
     def make() -> RobustPlan:
-        believed = belief(BEGIN, PLACE_STD, RADIUS, planner.config.particles, rng)
+        believed = disc_belief(BEGIN, PLACE_STD, RADIUS, planner.config.particles, rng)
         return planner.plan(HAND_START, believed, GoalTarget(END, TOLERANCE, LARGEST_STD))
 
     begin = time.thread_time()
@@ -153,23 +144,18 @@ def rehearse(plan: RobustPlan, rng: np.random.Generator) -> NDArray[np.float64]:
     motion = plan.trajectory
     assert motion is not None, "the disc does not begin at its goal"
     times = np.linspace(motion.start_time, motion.end_time, int(motion.duration / 0.02) + 2)
-    judged = make_dynamics(RADIUS, hand_effectors(), "friction")
-    final = judged.simulate(belief(BEGIN, PLACE_STD, RADIUS, ROLLOUTS, rng), motion(times), rng).belief
+    judged = FRICTION.dynamics(RADIUS, TOOL_KINDS["hand"].effectors)
+    believed = disc_belief(BEGIN, PLACE_STD, RADIUS, ROLLOUTS, rng)
+    final = judged.simulate(believed, motion(times), rng).belief
     return np.linalg.norm(final.poses[:, :2] - END, axis=1)
 
 
 def reach_both_ways(points: NDArray) -> NDArray[np.bool_]:
     """Whether the hand (K, 3) is within reach on the way there and back, and turned by a quarter at most."""
-    plane = _plane()
+    plane = tool_plane("hand")
     back = points * [-1.0, -1.0, 1.0] + [*(BEGIN + END), 0.0]
     lane = np.abs(points[:, 0] - 0.5 * (BEGIN + END)[0]) <= LARGEST_OFFSET
     return plane.contains(points) & plane.contains(back) & (np.abs(points[:, 2]) <= 1.65) & lane
-
-
-@functools.cache
-def _plane() -> ToolPlane:
-    kind = KINDS["hand"]
-    return kind.plane(kind.load(), PLANE_HEIGHT["hand"])
 
 
 def repeat(task: RepeatTask) -> RepeatResult:
