@@ -14,7 +14,7 @@ from vpsto_ros.contact.geometry import Disc, PlanarShape, Rectangle
 from vpsto_ros.exceptions import ConfigurationError, InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space import scoring
-from vpsto_ros.planning.belief_space.config import RobustPushingConfig
+from vpsto_ros.planning.belief_space.config import JointSpaceConfig, RobustPushingConfig
 from vpsto_ros.planning.belief_space.contacts import ContactRule, CrossingRule
 from vpsto_ros.planning.belief_space.plan_choice import best_plan
 from vpsto_ros.planning.belief_space.problem import INVALID_COST, RobustPushingProblem, require_free
@@ -591,8 +591,9 @@ def test_options_out_of_range_are_refused(options):
 TOOLS = BimanualPlane(fr3_bimanual())
 
 
-def joint_pusher(seed=0, **options):
-    return pusher(seed, space=lambda config: JointSpace(TOOLS, config), points=2, **options)
+def joint_pusher(seed=0, spread=0.1, **options):
+    joints = JointSpaceConfig(spread=spread)
+    return pusher(seed, space=lambda config: JointSpace(TOOLS, joints), points=2, **options)
 
 
 def test_in_joint_space_candidates_move_the_balls_where_kinematics_says():
@@ -607,7 +608,7 @@ def test_the_joint_space_prior_keeps_height_and_touches():
     """With a wide smoothness prior the contact prior alone says where; else it is a compromise."""
     start = TOOLS.joints(START[None])[0]
     for spread in (0.1, 3.0):
-        planner = joint_pusher(joint_spread=spread)
+        planner = joint_pusher(spread=spread)
         posed = RobustPushingProblem(
             planner.config, planner.dynamics, planner.space, planner.rule, start=start,
             velocity=np.zeros(14), belief=belief(), way=np.array([[0.6, 0.0, 0.0]]),
@@ -653,7 +654,7 @@ def test_joint_space_plans_keep_joint_limits_and_heights():
     assert motion.violations(planner.space.limits) == []
     np.testing.assert_allclose(motion(motion.end_time, 1), 0.0, atol=1e-9)
     planar, heights = planner.space.plane(motion(np.linspace(0.0, motion.duration, 2000))[None])
-    assert np.abs(heights - TOOLS.height).max() < planner.config.height_tolerance + 5e-4
+    assert np.abs(heights - TOOLS.height).max() < planner.space.height_tolerance + 5e-4
     assert separation_numpy(BALLS, planar[0], planner.config.separation, 0.05, 0.12) < 0.003
 
 

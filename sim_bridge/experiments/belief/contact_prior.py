@@ -23,6 +23,7 @@ from sim_bridge.experiments.belief.models import THESIS, disc_belief, mean_inter
 from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
 from vpsto_ros.planning.belief_space.problem import RobustPushingProblem
+from vpsto_ros.planning.belief_space.spaces import JointSpace
 
 CANDIDATES = 30
 SPACES = {"plane": "plane, 4 coordinates", "joints": "14 joints"}
@@ -92,11 +93,11 @@ def draw(seed: int) -> dict[tuple[str, str], Shares]:
         problem = pose_problem(scene, space, prior, rng)
         outcome = problem.outcome(problem.prior().sample(rng, CANDIDATES))
         contact = outcome.prediction.contact.max(axis=1)
-        _, heights = problem.space.plane(outcome.motion.position)
         level = np.ones(CANDIDATES, dtype=bool)
-        if heights is not None:
-            off = np.abs(heights - bimanual.arms().height).max(axis=(1, 2))
-            level = off <= problem.config.height_tolerance
+        if isinstance(problem.space, JointSpace):
+            _, heights = problem.space.plane(outcome.motion.position)
+            off = np.abs(heights - problem.space.height).max(axis=(1, 2))
+            level = off <= problem.space.height_tolerance
         touches = contact > 0.0
         found[space, prior] = Shares(
             float(touches.mean()), float((contact >= 1.0).mean()), float((touches & level).mean())

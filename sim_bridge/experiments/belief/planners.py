@@ -47,7 +47,7 @@ def robot_pusher(
         reach: where the tools may be, instead of wherever the robot reaches.
     """
     plane, effectors = tool_plane(robot), TOOL_KINDS[robot].effectors
-    space: SearchSpace = JointSpace(plane, config) if joints else PlaneSpace(effectors, config)
+    space: SearchSpace = JointSpace(plane) if joints else PlaneSpace(effectors, config)
     return RobustPusher(
         config, model.dynamics(radius, effectors), space, contact_rule(robot, radius, config), rng,
         reach=reach or plane.contains,

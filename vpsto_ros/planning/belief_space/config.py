@@ -18,7 +18,12 @@ class RobustPushingConfig:
     contact_prior: bool = option(True, "whether candidates are drawn around likely contacts (Q_q of 6.39)")
     points: int = option(2, "points per horizon N: via-points and the free end", minimum=1, maximum=10)
     steps: int = option(40, "steps of a horizon K", minimum=2, maximum=1000)
-    executed: int = option(12, "steps that are executed before planning anew, H", minimum=1, maximum=1000)
+    executed: int = option(
+        12,
+        "steps after which a plan made offline is continued anew, H; in closed loop every cycle plans anew",
+        minimum=1,
+        maximum=1000,
+    )
     perturbation: float = option(
         1e-6, "variance of the perturbation in a step V_w", unit="m^2", minimum=1e-12, maximum=1e-2
     )
@@ -101,22 +106,6 @@ class RobustPushingConfig:
     turn_acceleration: float = option(
         4.0, "largest yaw acceleration of a rectangular tool", unit="rad/s^2", minimum=0.01, maximum=100.0
     )
-    joint_speed: float = option(
-        0.3, "largest speed of a joint when planning in joint space", unit="rad/s", minimum=0.01, maximum=5.0
-    )
-    joint_acceleration: float = option(
-        1.5, "the same for its acceleration", unit="rad/s^2", minimum=0.01, maximum=20.0
-    )
-    joint_spread: float = option(
-        0.1, "the same for the smoothness prior's standard deviation", unit="rad", minimum=1e-4, maximum=10.0
-    )
-    height_tolerance: float = option(
-        0.004,
-        "largest deviation of a tool from its height when planning in joint space",
-        unit="m",
-        minimum=1e-4,
-        maximum=0.2,
-    )
     search: VpstoConfig = dataclasses.field(
         default_factory=lambda: VpstoConfig(population=30, iterations=10, strategy="cma")
     )
@@ -127,6 +116,26 @@ class RobustPushingConfig:
             raise ConfigurationError(
                 f"executed = {self.executed} is more than a horizon of steps = {self.steps} has"
             )
+
+
+@documented
+@dataclasses.dataclass(frozen=True)
+class JointSpaceConfig:
+    """Options of searching in the joints of the arms instead of the plane of their tools."""
+
+    speed: float = option(0.3, "largest speed of a joint", unit="rad/s", minimum=0.01, maximum=5.0)
+    acceleration: float = option(
+        1.5, "largest acceleration of a joint", unit="rad/s^2", minimum=0.01, maximum=20.0
+    )
+    spread: float = option(
+        0.1, "mean standard deviation of the smoothness prior", unit="rad", minimum=1e-4, maximum=10.0
+    )
+    height_tolerance: float = option(
+        0.004, "largest deviation of a tool from its height", unit="m", minimum=1e-4, maximum=0.2
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
 
 
 @documented

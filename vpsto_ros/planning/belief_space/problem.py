@@ -16,7 +16,7 @@ from vpsto_ros.planning.belief_space import scoring
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
 from vpsto_ros.planning.belief_space.contact_plan import likely_contact
 from vpsto_ros.planning.belief_space.contacts import ContactRule
-from vpsto_ros.planning.belief_space.spaces import SearchSpace
+from vpsto_ros.planning.belief_space.spaces import JointSpace, SearchSpace
 from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.trajectory import OptimalBasis, Trajectory, TrajectoryBatch, synthesize, synthesize_batch
@@ -171,8 +171,9 @@ class RobustPushingProblem:
         if limits.lower is not None and limits.upper is not None:
             found.append(np.maximum(limits.lower - positions, positions - limits.upper).max(axis=(1, 2)))
         if heights is not None:
-            height, off = self.space.height, np.empty(batch)  # type: ignore[attr-defined]
-            scoring.height_excess(heights, height, self.config.height_tolerance, off)
+            assert isinstance(self.space, JointSpace), "only it has heights"
+            off = np.empty(batch)
+            scoring.height_excess(heights, self.space.height, self.space.height_tolerance, off)
             found.append(off)
         return found
 

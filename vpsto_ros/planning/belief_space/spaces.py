@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.contact.end_effectors import EndEffectors
-from vpsto_ros.planning.belief_space.config import RobustPushingConfig
+from vpsto_ros.planning.belief_space.config import JointSpaceConfig, RobustPushingConfig
 from vpsto_ros.priors.contact import Factor, contact_factor, joint_contact_factor
 from vpsto_ros.robot.kinematics import TIP_NAMES
 from vpsto_ros.robot.tool_plane import ToolPlane
@@ -61,6 +61,7 @@ class JointSpace:
 
     Attributes:
         tools: kinematics of the tools over the plane.
+        height_tolerance: largest deviation of a tool from its height [m].
         limits: position limits of the arms; velocity and acceleration limits of slow pushing.
         weights: all joints alike.
         spread: mean standard deviation of the smoothness prior [rad].
@@ -70,16 +71,17 @@ class JointSpace:
     HEIGHT_STD = 0.001
     TILT_STD = 0.05
 
-    def __init__(self, tools: ToolPlane, config: RobustPushingConfig) -> None:
-        robot = tools.robot.limits
-        self.tools, self.height = tools, tools.height
+    def __init__(self, tools: ToolPlane, config: JointSpaceConfig | None = None) -> None:
+        """Arms that carry tools, and options, the usual ones if None."""
+        config, robot = config or JointSpaceConfig(), tools.robot.limits
+        self.tools, self.height, self.height_tolerance = tools, tools.height, config.height_tolerance
         self.limits = Limits(
-            np.minimum(robot.velocity, config.joint_speed),
-            np.minimum(robot.acceleration, config.joint_acceleration),
+            np.minimum(robot.velocity, config.speed),
+            np.minimum(robot.acceleration, config.acceleration),
             robot.lower,
             robot.upper,
         )
-        self.weights, self.spread = np.ones(robot.dof), config.joint_spread
+        self.weights, self.spread = np.ones(robot.dof), config.spread
 
     def plane(self, positions: NDArray) -> tuple[NDArray, NDArray]:
         """Forward kinematics of all samples in one pass."""
