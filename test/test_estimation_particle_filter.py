@@ -12,6 +12,7 @@ from vpsto_ros.belief.particles import ObjectBelief
 from vpsto_ros.contact.end_effectors import EndEffectors
 from vpsto_ros.contact.geometry import PlanarShape
 from vpsto_ros.estimation.contact_queries import particle_contacts
+from vpsto_ros.estimation.measurement import MeasurementLimits
 from vpsto_ros.estimation.object_state import wrap_angle
 from vpsto_ros.estimation.particle_cloud import ParticleCloud, moments, pose_moments, systematic
 from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
@@ -31,9 +32,9 @@ def dynamics(shape=CAN, effectors=BALL, **fields):
     return BeliefDynamics(shape, effectors, friction=True, step_variance=0.0, way_variance=1e-5, **fields)
 
 
-def make(seed=0, config=None, model=None, **fields):
+def make(seed=0, config=None, model=None, limits=None, **fields):
     config = dataclasses.replace(config or ParticleFilterConfig(), **fields)
-    return ObjectParticleFilter(config, model or dynamics(), np.random.default_rng([7, seed]))
+    return ObjectParticleFilter(config, model or dynamics(), np.random.default_rng([7, seed]), limits)
 
 
 def started(pose=(0.5, 0.0, 0.0), std=None, point=AWAY, seed=0, **kwargs):
@@ -185,7 +186,7 @@ def test_a_late_frame_counts_for_when_it_was_taken():
 
 
 def test_a_frame_may_be_late_but_not_older_than_the_past_that_is_kept():
-    tracker = started()
+    tracker = started(limits=MeasurementLimits(max_age=0.3))
     for k in range(1, 101):
         tracker.predict(0.01 * k, AWAY)
     pose = np.array([0.5, 0.0, 0.0])
@@ -498,12 +499,30 @@ def test_the_yaw_of_a_disc_is_not_looked_at():
         assert tracker.update(0.02 * k, np.array([0.5, 0.0, 2.0 * (-1) ** k]), CAMERA) == "accepted"
 
 
+def test_limits_are_those_that_were_given():
+    """What each limit of its own refuses, a wider one lets through."""
+    narrow, wide = MeasurementLimits((0.45, 0.55), (-0.05, 0.05), 0.05, 0.0), MeasurementLimits()
+    for stamp, x, y in ((0.1, 0.6, 0.0), (0.1, 0.5, 0.1), (0.04, 0.5, 0.0), (0.11, 0.5, 0.0)):
+        outcomes = {}
+        for limits in (narrow, wide):
+            tracker = started(limits=limits, std=0.1)
+            for k in range(1, 11):
+                tracker.predict(0.01 * k, AWAY)
+            outcomes[limits] = tracker.update(stamp, [x, y, 0.0], 1e-2 * np.eye(3)).kind
+        assert outcomes[narrow] in ("invalid", "stale") and outcomes[wide] == "accepted", (stamp, x, y)
+
+
 @pytest.mark.parametrize(
-    "fields", [{"particles": 1}, {"friction": (0.5, 0.1)}, {"outlier_share": 0.0}, {"table_x": (1.0, 0.0)}]
-)
-def test_a_bad_option_is_named(fields):
+    ("config", "fields"),
+    [
+        (ParticleFilterConfig, {"particles": 1}), (ParticleFilterConfig, {"friction": (0.5, 0.1)}),
+        (ParticleFilterConfig, {"outlier_share": 0.0}), (MeasurementLimits, {"table_x": (1.0, 0.0)}),
+        (MeasurementLimits, {"max_age": 0.0}),
+    ],
+)  # fmt: skip
+def test_a_bad_option_is_named(config, fields):
     with pytest.raises(ConfigurationError, match=next(iter(fields))):
-        ParticleFilterConfig(**fields)
+        config(**fields)
 
 
 def test_moments_are_numpys():

@@ -1,5 +1,7 @@
 """Robust pushing in the nodes: particles, contact plans of two tools, two arms; refusals and stops."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from vpsto_ros.estimation.measurement import MeasurementLimits
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.planar_kalman import PlanarKalmanConfig
 from vpsto_ros.exceptions import ConfigurationError
@@ -34,7 +37,7 @@ from vpsto_ros.nodes.joint_conversions import joint_state_message, trajectory_fr
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.nodes.robots import BeliefModelConfig, RobotConfig, contact_rule
-from vpsto_ros.nodes.scene import ModelConfig, ShapeConfig
+from vpsto_ros.nodes.scene import ModelConfig, ShapeConfig, TableConfig
 from vpsto_ros.nodes.state_estimator import StateEstimator
 from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
 from vpsto_ros.planning.belief_space.config import RobustMpcConfig, RobustPushingConfig
@@ -193,6 +196,126 @@ def test_a_restarted_simulation_starts_the_particles_afresh(estimator):
     assert np.allclose(state.pose[:2], PLACE[:2] + [0.1, 0.0], atol=3e-3)
 
 
+LIMITS = {"max_age": 0.2, "max_ahead": 0.02, "table__x": [0.3, 0.55], "table__y": [-0.2, 0.2]}
+
+
+def test_limits_set_on_the_node_are_those_of_its_particles(bench):
+    made = bench(StateEstimator, "state_estimator", kind="particles", **LIMITS, **BIMANUAL)
+    limits = MeasurementLimits((0.3, 0.55), (-0.2, 0.2), max_age=0.2, max_ahead=0.02)
+    assert made.node.config.limits == made.node.estimator.limits == limits
+    names = made.node.get_parameters_by_prefix("particles")
+    assert names and not {"history", "max_ahead", "table_x", "table_y"} & set(names), "set once only"
+
+
+def test_every_limit_that_a_node_takes_its_particles_take():
+    for field in dataclasses.fields(StateEstimatorConfig):
+        if field.name in ("max_age", "max_ahead"):
+            for bound in ("minimum", "maximum"):
+                made = StateEstimatorConfig(**{field.name: field.metadata[bound]}).limits
+                assert getattr(made, field.name) == field.metadata[bound]
+    wide = StateEstimatorConfig(table=TableConfig((-3.0, 3.0), (-3.0, 3.0))).limits
+    assert wide.table_x == wide.table_y == (-3.0, 3.0)
+    assert StateEstimatorConfig().limits == MeasurementLimits(), "one default, with or without nodes"
+
+
+def test_particles_take_frames_as_old_as_the_node_allows(bench):
+    for allowed, age, counted in ((1.0, 0.7, 0), (0.2, 0.15, 0), (0.2, 0.3, 1)):
+        made = bench(StateEstimator, "state_estimator", kind="particles", max_age=allowed, **BIMANUAL)
+        made.talk(PoseWithCovarianceStamped, "object_pose")
+        made.talk(JointState, "joint_states")
+        made.connect()
+        made.advance(1.0, each=watched(made, camera=False))
+        see(made, PLACE, age=age)
+        made.advance(0.02)
+        assert sum(made.node.complaints.counts.values()) == counted, made.node.complaints.counts
+        assert np.isfinite(made.node.estimator.frame_stamp) == (not counted)
+        made.close()
+
+
+def test_a_frame_ahead_of_the_last_joint_states_is_refused_by_the_limit_of_the_node(bench):
+    for allowed, counted in ((0.2, 0), (0.02, 1)):
+        made = bench(StateEstimator, "state_estimator", kind="particles", max_ahead=allowed, **BIMANUAL)
+        made.talk(PoseWithCovarianceStamped, "object_pose")
+        made.talk(JointState, "joint_states")
+        made.connect()
+        made.advance(0.3, each=watched(made, camera=False))
+        made.advance(0.1)
+        see(made, PLACE, age=0.0)
+        made.advance(0.02)
+        assert made.node.complaints.counts["invalid"] == counted, made.node.complaints.counts
+        made.close()
+
+
+def wrench(bench, force, age=0.0):
+    message = WrenchStamped()
+    message.header.stamp, message.header.frame_id = bench.stamp(-age), FRAME
+    message.wrench.force.x, message.wrench.force.y = force
+    bench.send("external_wrench", message)
+
+
+@pytest.fixture
+def feeling(bench):
+    made = bench(StateEstimator, "state_estimator", kind="particles", touch=True, **BIMANUAL)
+    made.talk(PoseWithCovarianceStamped, "object_pose")
+    made.talk(JointState, "joint_states")
+    made.talk(WrenchStamped, "external_wrench")
+    made.connect()
+    return made
+
+
+def feel(bench, duration, force, age=0.0, *, camera=True):
+    """A force that is measured at 50 Hz while the balls stand away from an object that is seen."""
+    follow = watched(bench, camera=camera)
+
+    def each(t):
+        follow(t)
+        if round(t * 100) % 2 == 0:
+            wrench(bench, force, age)
+
+    bench.advance(duration, each=each)
+
+
+def test_forces_that_say_nothing_new_are_no_complaint(feeling):
+    """Nor are those that come before the object is seen."""
+    feel(feeling, 0.4, (0.0, 0.0), camera=False)
+    feel(feeling, 0.8, (0.0, 0.0))
+    report = feeling.node.report()
+    assert report.level == 0, report.message
+    assert not feeling.node.complaints.counts and not any("touch" in name for name in report.values)
+
+
+NOBODY_NEAR = "a force is felt where no particle is near"
+
+
+def test_a_force_where_no_particle_is_near_is_counted_and_said(feeling):
+    feel(feeling, 0.4, (0.0, 0.0))
+    feel(feeling, 0.5, (-3.0, 0.0))
+    report = feeling.node.report()
+    assert report.level == 1 and report.message == "force not used, outlier: " + NOBODY_NEAR
+    assert 3 <= int(report.values["rejected.touch_outlier"]) <= 7, "once per touch.interval, not at 50 Hz"
+    assert "rejected.outlier" not in report.values, "poses are counted apart"
+
+
+@pytest.mark.parametrize(
+    ("age", "kind", "words"),
+    [
+        (1.5, "external_wrench", "external_wrench refused: it is 1.5"),
+        (-0.3, "external_wrench", "in the future (allowed 0.1 s)"),
+    ],
+)
+def test_forces_too_old_or_ahead_are_refused_by_the_limits_of_the_node(feeling, age, kind, words):
+    feel(feeling, 0.4, (0.0, 0.0))
+    feel(feeling, 0.2, (-3.0, 0.0), age)
+    assert feeling.node.complaints.counts[kind] == 10 and words in feeling.node.complaints.recent(60.0)
+
+
+def test_forces_without_joint_states_are_counted(feeling):
+    feel(feeling, 0.4, (0.0, 0.0))
+    feeling.advance(0.3, each=lambda _: wrench(feeling, (0.0, 0.0)))
+    assert feeling.node.complaints.counts["touch_invalid"] >= 15
+    assert "ahead of the last plane point" in feeling.node.complaints.recent(60.0)
+
+
 def test_touch_narrows_the_belief_where_it_is_asked_for(bench):
     spreads = {}
     for touch in (False, True):
@@ -214,10 +337,7 @@ def test_touch_narrows_the_belief_where_it_is_asked_for(bench):
             if t < 0.2:
                 see(made, PLACE, age=0.0, std=0.02)
             elif touch:
-                wrench = WrenchStamped()
-                wrench.header.stamp, wrench.header.frame_id = made.stamp(), FRAME
-                wrench.wrench.force.x = -3.0
-                made.send("external_wrench", wrench)
+                wrench(made, (-3.0, 0.0))
 
         made.advance(0.5, each=each)
         poses = read_belief(made.received["object_belief"][-1], FRAME)

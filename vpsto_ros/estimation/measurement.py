@@ -6,9 +6,52 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import wrap_angle
+from vpsto_ros.exceptions import ConfigurationError
 
 _FARTHEST = 1e3  # no object on a table is farther away [m]
+_VAGUE = 1.0  # a position is measured better, or not at all [m]
+
+
+@documented
+@dataclasses.dataclass(frozen=True)
+class MeasurementLimits:
+    """Where and when an object can have been measured; all else is refused.
+
+    Raises:
+        ConfigurationError: a value is out of range; the message names what is allowed.
+    """
+
+    table_x: tuple[float, float] = option(
+        (0.1, 1.0), "where on the table the object can be, x", unit="m", minimum=-10.0, maximum=10.0
+    )
+    table_y: tuple[float, float] = option(
+        (-0.7, 0.7), "where on the table the object can be, y", unit="m", minimum=-10.0, maximum=10.0
+    )
+    max_age: float = option(
+        1.0, "how late a measurement may be, and how long the past is kept", unit="s", minimum=0.01,
+        maximum=5.0,
+    )  # fmt: skip
+    max_ahead: float = option(
+        0.1, "how far a stamp may be ahead of the robot's last one", unit="s", minimum=0.0, maximum=10.0
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+        for name in ("table_x", "table_y"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ConfigurationError(f"MeasurementLimits.{name} = {(low, high)} is not a range")
+
+    def objection(self, pose: NDArray, covariance: NDArray) -> str:
+        """Why no object can have been measured at a pose (3,) with a covariance (3, 3), else empty."""
+        (left, right), (front, back) = self.table_x, self.table_y
+        x, y = pose[:2]
+        if not (left <= x <= right and front <= y <= back):
+            return f"the object at ({x:.3f}, {y:.3f}) m is outside the table"
+        vague = np.diag(covariance)[:2].max() > _VAGUE**2
+        return f"its standard deviation is above {_VAGUE} m: it tells nothing" if vague else ""
 
 
 class Outcome(str):

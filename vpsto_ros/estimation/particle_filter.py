@@ -20,7 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.belief.particles import ObjectBelief
 from vpsto_ros.estimation import touch as touching
-from vpsto_ros.estimation.measurement import Outcome, PoseMeasurement, checked, could_follow, finite_array
+from vpsto_ros.estimation.measurement import (
+    MeasurementLimits,
+    Outcome,
+    PoseMeasurement,
+    checked,
+    could_follow,
+    finite_array,
+)
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.particle_cloud import ParticleCloud, object_state, pose_moments, systematic
 from vpsto_ros.estimation.particle_filter_config import FilterStatus, ParticleFilterConfig, unseen
@@ -38,7 +45,11 @@ class ObjectParticleFilter:
     """
 
     def __init__(
-        self, config: ParticleFilterConfig, dynamics: BeliefDynamics, rng: np.random.Generator
+        self,
+        config: ParticleFilterConfig,
+        dynamics: BeliefDynamics,
+        rng: np.random.Generator,
+        limits: MeasurementLimits | None = None,
     ) -> None:
         """Nothing is known yet.
 
@@ -46,8 +57,11 @@ class ObjectParticleFilter:
             config: options.
             dynamics: object, end effectors and noise; with friction, particles carry some.
             rng: source of randomness. Asking for a belief does not change what the filter draws.
+            limits: where the object can be, and how late or early measurements may be; the default ones if
+                None.
         """
         self.config, self.dynamics = config, dynamics
+        self.limits = limits or MeasurementLimits()
         self._rng = rng
         self._reader = np.random.default_rng(rng.integers(2**63))
         self._model_covariance = np.diag([config.model_std[0], *config.model_std]) ** 2
@@ -57,7 +71,7 @@ class ObjectParticleFilter:
 
     def reset(self) -> None:
         """Forget everything, also how late it is."""
-        self._cloud = ParticleCloud(self.config.history)
+        self._cloud = ParticleCloud(self.limits.max_age)
         self._seen = self._stamp = self._touched = -math.inf
         self._felt: tuple[bool, ...] = ()
         self._pending: list[PoseMeasurement] = []
@@ -100,7 +114,7 @@ class ObjectParticleFilter:
         """Take in a measured pose.
 
         Args:
-            stamp: when it was measured [s]; may be as late as ``history``, but newer than the last one.
+            stamp: when it was measured [s]; may be late by ``limits.max_age``, but newer than the last one.
             pose: x, y [m] and yaw [rad] in the base frame, shape (3,).
             covariance: of the pose, shape (3, 3).
 
@@ -133,7 +147,7 @@ class ObjectParticleFilter:
         """Take in measured contact forces, or that there are none.
 
         Args:
-            stamp: when [s]; no later than ``history`` ago.
+            stamp: when [s]; no longer than ``limits.max_age`` ago.
             force: on the robot, in the plane, as in `external_wrench` [N]: on each end effector, shape
                 (E, 2), or their sum, shape (2,).
             noise: standard deviation of a component [N].
@@ -215,22 +229,22 @@ class ObjectParticleFilter:
 
     def _refusal(self, measurement: PoseMeasurement) -> Outcome | None:
         """Why a well-formed pose cannot be used, None if it can."""
-        cloud, config = self._cloud, self.config
+        cloud, limits = self._cloud, self.limits
         self._trouble = ""
         if not cloud.past:
             self._trouble = "no plane point of the end effectors yet"
-        elif measurement.stamp > cloud.head.time + config.max_ahead:
+        elif measurement.stamp > cloud.head.time + limits.max_ahead:
             ahead = measurement.stamp - cloud.head.time
             self._trouble = f"stamp is {ahead:.2g} s ahead of the last plane point"
         else:
-            self._trouble = config.objection(measurement.pose, measurement.covariance)
+            self._trouble = limits.objection(measurement.pose, measurement.covariance)
         if self._trouble:
             return Outcome("invalid", self._trouble)
         if measurement.stamp <= self._stamp:
             return Outcome("stale", f"stamp is {self._stamp - measurement.stamp:.4g} s older than the last")
         late = cloud.head.time - measurement.stamp
-        if late > config.history:
-            return Outcome("stale", f"{late:.2g} s late; the particles remember {config.history} s")
+        if late > limits.max_age:
+            return Outcome("stale", f"{late:.2g} s late; the particles remember {limits.max_age} s")
         return None
 
     def _touch_refusal(self, stamp: float) -> Outcome | None:
@@ -238,9 +252,9 @@ class ObjectParticleFilter:
         if not cloud.begun:
             return Outcome("invalid", "nothing is known about the object yet")
         ahead = stamp - cloud.head.time
-        if ahead > self.config.max_ahead:
+        if ahead > self.limits.max_ahead:
             return Outcome("invalid", f"stamp is {ahead:.2g} s ahead of the last plane point")
-        if stamp < self._touched or -ahead > self.config.history:
+        if stamp < self._touched or -ahead > self.limits.max_age:
             return Outcome("stale", f"stamp is {-ahead:.4g} s late, or older than the last one")
         return None
 

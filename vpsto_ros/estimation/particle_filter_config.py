@@ -3,14 +3,9 @@
 import dataclasses
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.touch import TouchConfig
 from vpsto_ros.exceptions import ConfigurationError
-
-_VAGUE = 1.0  # a position is measured better, or not at all [m]
 
 
 @documented
@@ -72,10 +67,6 @@ class ParticleFilterConfig:
     max_speed: float = option(
         1.0, "speed up to which unlikely poses agree", unit="m/s", minimum=1e-3, maximum=100.0
     )
-    history: float = option(0.3, "how late a measurement may be", unit="s", minimum=0.01, maximum=5.0)
-    max_ahead: float = option(
-        0.05, "how far a stamp may be ahead of the last plane point", unit="s", minimum=0.0, maximum=1.0
-    )
     longest_gap: float = option(
         0.2, "gap between plane points beyond which the way in between is taken to be unknown", unit="s",
         minimum=0.01, maximum=10.0,
@@ -102,28 +93,11 @@ class ParticleFilterConfig:
         0.03, "standard deviation of the position above which it is uncertain", unit="m", minimum=1e-4,
         maximum=10.0,
     )  # fmt: skip
-    table_x: tuple[float, float] = option(
-        (0.15, 0.95), "where on the table the object can be, x", unit="m", minimum=-10.0, maximum=10.0
-    )
-    table_y: tuple[float, float] = option(
-        (-0.7, 0.7), "where on the table the object can be, y", unit="m", minimum=-10.0, maximum=10.0
-    )
 
     def __post_init__(self) -> None:
         validate(self)
-        for name in ("friction", "table_x", "table_y"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ConfigurationError(f"ParticleFilterConfig.{name} = {(low, high)} is not a range")
-
-    def objection(self, pose: NDArray, covariance: NDArray) -> str:
-        """Why an object cannot have been measured there, empty if it can."""
-        (left, right), (front, back) = self.table_x, self.table_y
-        x, y = pose[:2]
-        if not (left <= x <= right and front <= y <= back):
-            return f"the object at ({x:.3f}, {y:.3f}) m is outside the table"
-        vague = np.diag(covariance)[:2].max() > _VAGUE**2
-        return f"its standard deviation is above {_VAGUE} m: it tells nothing" if vague else ""
+        if self.friction[0] > self.friction[1]:
+            raise ConfigurationError(f"ParticleFilterConfig.friction = {self.friction} is not a range")
 
 
 @dataclasses.dataclass(frozen=True)

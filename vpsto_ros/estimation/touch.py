@@ -1,9 +1,13 @@
 """What touch tells about an object: contact, or none, and the direction of the force (outlook 7.2.3).
 
-A force that is felt says that the object is on the contact manifold of that end effector: where the gap is
-zero, a set without measure that particles hit only by being pushed. So before weighing, a share of them is
-moved onto it along the normals, with importance weights that make up for it. No force says that nothing is
-being pushed; an object may well be touched at rest without any.
+A force that is felt on an end effector says that the object is on the contact manifold of that one: where
+the gap is zero, a set without measure that particles hit only by being pushed. So before weighing, a share of
+them is moved onto it along the normals, with importance weights that make up for it. No force says that
+nothing is being pushed; an object may well be touched at rest without any.
+
+To know the force on each of several end effectors takes a sensor in each. The sum of the forces says less:
+that one of them is in contact, but not which (particles are moved to the one that is most likely near), and a
+direction within the hull of all cones that may share in it; forces that cancel are not felt at all.
 """
 
 import dataclasses

@@ -9,16 +9,17 @@ import math
 from typing import Any, Protocol
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
-from vpsto_ros.belief.dynamics import BeliefDynamics
-from vpsto_ros.estimation.measurement import Outcome
+from vpsto_ros.estimation.measurement import MeasurementLimits, Outcome
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
-from vpsto_ros.estimation.particle_filter_config import FilterStatus, ParticleFilterConfig
+from vpsto_ros.estimation.particle_filter_config import FilterStatus
 from vpsto_ros.estimation.planar_kalman import PlanarKalman, PlanarKalmanConfig
+from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes.conversions import require_finite, require_frame
 from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode
@@ -65,6 +66,20 @@ class Bridging:
 
     fresh: float
     prediction: float
+
+
+def measured_at(node: ManagedNode, stamp: Time, limits: MeasurementLimits) -> float:
+    """When something that has just come was measured [s].
+
+    Raises:
+        InvalidInputError: longer ago than may be, or in the future.
+        NoTimeYet: the simulation's clock was not heard yet.
+    """
+    when = node.seconds(stamp, limits.max_ahead)
+    age = node.now() - when
+    if age > limits.max_age:
+        raise InvalidInputError(f"it is {age:.2f} s old (allowed {limits.max_age} s)")
+    return when
 
 
 class KalmanEstimator:
@@ -119,19 +134,16 @@ class KalmanEstimator:
 class ParticleEstimator:
     """Particles that are pushed along by the tools; a state is of the last measured posture of the robot."""
 
-    def __init__(
-        self,
-        config: ParticleFilterConfig,
-        dynamics: BeliefDynamics,
-        tools: ToolPlane,
-        bridging: Bridging,
-        rng: np.random.Generator,
-    ) -> None:
+    def __init__(self, particles: ObjectParticleFilter, tools: ToolPlane, bridging: Bridging) -> None:
         """Compile the filter."""
-        self._tools, self._bridging = tools, bridging
-        self._filter = ObjectParticleFilter(config, dynamics, rng)
+        self._filter, self._tools, self._bridging = particles, tools, bridging
         self._warm_up()
         self.reset()
+
+    @property
+    def limits(self) -> MeasurementLimits:
+        """Which measurements the filter takes."""
+        return self._filter.limits
 
     @property
     def frame_stamp(self) -> float:
@@ -156,7 +168,11 @@ class ParticleEstimator:
             require_frame(message.header, frame)
             force = np.array([message.wrench.force.x, message.wrench.force.y])
             require_finite("force", force)
-            self._filter.touch(node.seconds(message.header.stamp), force, force_noise)
+            stamp = measured_at(node, message.header.stamp, self.limits)
+            outcome = self.feel(stamp, force, force_noise)
+            if outcome.kind not in ("accepted", "stale"):
+                words = f"force not used, {outcome.kind}: {outcome.reason}"
+                node.complaints.add(f"touch_{outcome.kind}", words)
 
         node.subscribe(JointState, "joint_states", receive_joints)
         if touch:
@@ -166,6 +182,22 @@ class ParticleEstimator:
         """Push the particles to where the tools are at joint positions (n,) [rad]."""
         if self._filter.predict(stamp, self._tools.tool(joints)) == "accepted":
             self._moved = stamp
+
+    def feel(self, stamp: float, force: NDArray, noise: float) -> Outcome:
+        """Weigh the particles by the sum of the forces on the tools.
+
+        Args:
+            stamp: when it was measured [s].
+            force: on the robot, x and y in the base frame, shape (2,) [N].
+            noise: standard deviation of a component [N].
+
+        Returns:
+            What became of it; "stale" where it adds nothing: it says the same as the last one, or no object
+            has been seen yet.
+        """
+        if not math.isfinite(self._frame_stamp):
+            return Outcome("stale", "no object has been seen yet")
+        return self._filter.touch(stamp, force, noise)
 
     def reset(self) -> None:
         """Forget the object and the tools."""
@@ -202,17 +234,18 @@ class ParticleEstimator:
         return {"particles": self._filter.config.particles}
 
     def _warm_up(self) -> None:
-        """Push an imaginary object, and look at it."""
+        """Push an imaginary object, and look at it, with a filter whose table it is on."""
         dynamics, tools = self._filter.dynamics, self._tools
+        twin = ObjectParticleFilter(self._filter.config, dynamics, np.random.default_rng(0))
         point = np.zeros(tools.dof)
         for column in dynamics.effectors.columns:
             point[column : column + 2] = 0.4, 0.1 - 0.1 * column
         tools.tool(tools.joints(point[None])[0])
         for index in range(8):
             point = point + 0.002
-            self._filter.predict(0.01 * index, point)
+            twin.predict(0.01 * index, point)
             pose = _SEEN + np.array([0.004 * index, 0.0, 0.0])
-            self._filter.update(0.01 * index, pose, 1e-6 * np.eye(3))
-            self._filter.touch(0.01 * index, np.array([2.0, 0.0]), 0.1)
-        self._filter.belief(0.08, 10)
-        self._filter.state(0.08)
+            twin.update(0.01 * index, pose, 1e-6 * np.eye(3))
+            twin.touch(0.01 * index, np.array([2.0, 0.0]), 0.1)
+        twin.belief(0.08, 10)
+        twin.state(0.08)

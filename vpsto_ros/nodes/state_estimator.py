@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 from visualization_msgs.msg import MarkerArray
 
 from vpsto_ros.estimation.object_state import ObjectState
-from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import belief_message, read_observation, state_message
 from vpsto_ros.nodes.diagnostics import OK, STALE, WARN, Diagnostics, Durations, Rate
-from vpsto_ros.nodes.estimators import Bridging, KalmanEstimator, ObjectEstimator, ParticleEstimator
+from vpsto_ros.nodes.estimators import (
+    Bridging,
+    KalmanEstimator,
+    ObjectEstimator,
+    ParticleEstimator,
+    measured_at,
+)
 from vpsto_ros.nodes.lifecycle import ManagedNode, best_effort, latched, reliable, run
 from vpsto_ros.nodes.robots import belief_dynamics
 from vpsto_ros.nodes.state_estimator_config import KALMAN, StateEstimatorConfig
@@ -49,7 +55,8 @@ class StateEstimator(ManagedNode):
         if config.kind == KALMAN:
             return KalmanEstimator(config.filter, bridging, rng)
         dynamics = belief_dynamics(config.robot, config.model, config.way_variance)
-        made = ParticleEstimator(config.particles, dynamics, config.robot.plane(), bridging, rng)
+        particles = ObjectParticleFilter(config.particles, dynamics, rng, config.limits)
+        made = ParticleEstimator(particles, config.robot.plane(), bridging)
         made.listen(self, config.base_frame, config.force_noise, touch=config.touch)
         return made
 
@@ -105,15 +112,10 @@ class StateEstimator(ManagedNode):
         with self._update_time.measured():
             reading, covariance = read_observation(message, self.config.base_frame)
             self.config.table.check(reading)
-            now, stamp = self.now(), self.seconds(message.header.stamp, self.config.max_ahead)
-            self._check_age(stamp, now)
+            stamp, now = measured_at(self, message.header.stamp, self.config.limits), self.now()
             self._update(stamp, reading.pose, self._default_covariance if covariance is None else covariance)
         self._last_frame = now
         self._publish(now)
-
-    def _check_age(self, stamp: float, now: float) -> None:
-        if stamp < now - self.config.max_age:
-            raise InvalidInputError(f"the frame is {now - stamp:.2f} s old (allowed {self.config.max_age} s)")
 
     def _update(self, stamp: float, pose: NDArray, covariance: NDArray) -> None:
         outcome = self.estimator.update(stamp, pose, covariance)

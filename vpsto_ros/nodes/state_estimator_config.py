@@ -3,6 +3,7 @@
 import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.estimation.measurement import MeasurementLimits
 from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
 from vpsto_ros.estimation.planar_kalman import PlanarKalmanConfig
 from vpsto_ros.exceptions import ConfigurationError
@@ -42,9 +43,20 @@ class StateEstimatorConfig(NodeConfig):
         minimum=0.0,
         maximum=5.0,
     )
-    max_age: float = option(1.0, "older frames are refused", unit="s", minimum=0.01, maximum=60.0)
+    max_age: float = option(
+        1.0,
+        "older frames and forces are refused; particles remember their way for so long",
+        unit="s",
+        minimum=0.01,
+        maximum=5.0,
+    )
     max_ahead: float = option(
-        0.1, "frames farther in the future are refused", unit="s", minimum=0.0, maximum=10.0
+        0.1,
+        "frames and forces farther in the future are refused; with particles, also those so far ahead of the "
+        "last joint_states",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
     )
     position_std: float = option(
         0.005, "standard deviation of x and y where a frame gives none", unit="m", minimum=1e-5, maximum=1.0
@@ -53,7 +65,11 @@ class StateEstimatorConfig(NodeConfig):
         0.05, "standard deviation of yaw where a frame gives none", unit="rad", minimum=1e-5, maximum=3.0
     )
     seed: int = option(0, "seed of the belief's samples, and of the particles", minimum=0)
-    touch: bool = option(False, "whether particles are weighed by external_wrench as well")
+    touch: bool = option(
+        False,
+        "whether particles are weighed by external_wrench as well, the sum of the forces on all tools; which "
+        "of several tools touches, only a sensor in each could tell",
+    )
     force_noise: float = option(
         0.2, "standard deviation of a component of external_wrench", unit="N", minimum=0.0, maximum=100.0
     )
@@ -69,6 +85,11 @@ class StateEstimatorConfig(NodeConfig):
     particles: ParticleFilterConfig = dataclasses.field(default_factory=ParticleFilterConfig)
     robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+
+    @property
+    def limits(self) -> MeasurementLimits:
+        """Where the object can be and how old what is measured may be, for the node and its particles."""
+        return MeasurementLimits(self.table.x, self.table.y, self.max_age, self.max_ahead)
 
     def __post_init__(self) -> None:
         validate(self)
