@@ -198,3 +198,34 @@ def test_interval_of_a_mean():
     low, high = mean_interval(np.arange(100.0))
     assert 42.0 < low < 46.0 and 53.0 < high < 57.0
     assert mean_interval([0.3, 0.3]) == (0.3, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_deviation_standard_errors", 4.5), ("max_mean_deviation_standard_errors", 4.5),
+        ("max_prediction_error_centred", 1e-3),
+    ],
+)  # fmt: skip
+def test_every_target_of_the_belief_in_one_dimension_can_be_missed(name, value):
+    good = {
+        "max_deviation_standard_errors": 2.0, "max_mean_deviation_standard_errors": 2.0,
+        "max_prediction_error_centred": 1e-12,
+    }  # fmt: skip
+    assert belief_1d.missed_targets(good) == []
+    assert len(belief_1d.missed_targets({**good, name: value})) == 1
+
+
+def test_every_target_of_the_variance_gain_can_be_missed():
+    gains = {
+        name: {"gain": gain, "interval": [gain - 0.01, gain + 0.01]}
+        for name, gain in (("one_finger", 1.17), ("flat", 1.0), ("two_fingers", 0.5))
+    }
+    good = {"max_deviation_standard_errors": 2.0, "models": dict.fromkeys(variance_gain.MODELS, gains)}
+    assert variance_gain.missed_targets(good) == []
+    assert len(variance_gain.missed_targets({**good, "max_deviation_standard_errors": 3.5})) == 1
+    for name, value in (("one_finger", 1.005), ("flat", 1.03), ("two_fingers", 0.995)):
+        for model in variance_gain.MODELS:
+            other = {"gain": value, "interval": [value - 0.01, value + 0.01]}
+            models = {**good["models"], model: {**gains, name: other}}
+            assert len(variance_gain.missed_targets({**good, "models": models})) == 1
