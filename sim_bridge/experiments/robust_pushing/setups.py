@@ -19,12 +19,12 @@ from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
 
 BIMANUAL = RobustPushingConfig(jitter=0.004, executed=16)
 HAND = RobustPushingConfig(
-    points=3, steps=60, executed=20, jitter=0.004, duration_weight=0.05, speed=0.15, acceleration=0.7,
-    turn_speed=1.2, search=VpstoConfig(population=30, iterations=20, strategy="cma"),
+    points=3, steps=60, executed=20, particles=40, jitter=0.004, variance_weight=10.0, duration_weight=0.05,
+    speed=0.15, acceleration=0.7, turn_speed=1.2, search=VpstoConfig(population=30, iterations=20, strategy="cma"),
 )  # fmt: skip
 
 STRAIGHT_HAND = dataclasses.replace(
-    HAND, contact_std=0.01, contact_yaw_std=0.01, smoothness_spread=0.02, duration_weight=0.0
+    HAND, particles=20, contact_std=0.01, contact_yaw_std=0.01, smoothness_spread=0.02, duration_weight=0.0
 )
 """The deterministic plan of the thesis is straight, the long side across. Left to itself the baseline swings
 the hand, which moves the object faster than the hand's speed limit and loses it in the first push."""

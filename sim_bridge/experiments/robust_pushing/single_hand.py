@@ -4,7 +4,7 @@ Three robust plans and three of the deterministic baseline are each repeated, at
 whose friction, mass and centre of mass no planner knows, on a slightly tilted table, with a little
 displacement between any two pushes. These disturbances were calibrated, on seeds from 1000 on, so that the
 baseline loses the object after five to nine pushes on average, as in the thesis (6.8). A robust plan is the
-best of five by its own noisy rollouts; the baseline, which knows of no noise, has nothing to choose by.
+best of ten by its own noisy rollouts; the baseline, which knows of no noise, has nothing to choose by.
 """
 
 import argparse
@@ -30,6 +30,7 @@ from sim_bridge.experiments.runs import (
 )
 from sim_bridge.scene import HandStart, Scene
 from sim_bridge.simulation import Simulation
+from vpsto_ros.belief.particles import ObjectBelief
 from vpsto_ros.planning.belief_space.plan_choice import best_plan
 from vpsto_ros.planning.belief_space.receding_horizon import RobustPlan
 from vpsto_ros.planning.belief_space.targets import GoalTarget
@@ -42,7 +43,11 @@ BEGIN, END = np.array([0.5, -0.12]), np.array([0.5, 0.12])
 HAND_START = np.array([0.5, -0.24, 0.0])
 ASIDE = 0.685
 """x of the lane in which the hand goes round [m]."""
-PLACE_STD = 0.012
+PLACE_STD, PUSHED_FRICTION = 0.02, (0.0, 0.8)
+"""What robust plans are made for and rehearsed with: more than the disturbances, since one push in hundreds
+would end a run. How exactly the object is put [m], and its friction against the hand."""
+BASELINE_STD = 0.012
+"""The baseline plans for the mean of some places drawn with this standard deviation [m]."""
 TOLERANCE, LARGEST_STD = 0.008, 0.006
 """When a plan is done: distance of the belief's mean from the goal, root of its variance [m]."""
 MOST_PUSHES = 40
@@ -51,11 +56,13 @@ LOST = 0.05
 SLOPE, DISPLACEMENT = np.deg2rad(2.0), 0.007
 """Largest tilt of the table [rad]; standard deviation of what displaces the object between pushes [m]."""
 PLANS, EXPERIMENTS = 3, 10
-ATTEMPTS = 5
+ATTEMPTS = 10
 """Plans of which the best is taken."""
+NEAR = 0.03
+"""A rehearsal succeeds when it ends this near the goal [m]."""
 LARGEST_OFFSET = 0.16
 """How far the hand may leave the line of the push: what it can come back from on the mirrored way [m]."""
-ROLLOUTS = 1000
+ROLLOUTS = 3000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +81,7 @@ class PlanResult:
         motion: of the hand.
         reached: whether the planner says that it gets there.
         seconds: processor time of planning.
-        near: share of noisy rollouts that end within 2 cm of the goal.
+        near: share of noisy rollouts that end within NEAR of the goal.
         worst: the largest of their errors [m].
     """
 
@@ -126,16 +133,15 @@ def make_plan(task: PlanTask) -> PlanResult:
     planner = pusher("hand", RADIUS, model, rng, robust=task.robust, config=config, reach=reach_both_ways)
 
     def make() -> RobustPlan:
-        believed = disc_belief(BEGIN, PLACE_STD, RADIUS, planner.config.particles, rng)
+        believed = _believed(planner.config.particles, PLACE_STD if task.robust else BASELINE_STD, rng)
         return planner.plan(HAND_START, believed, GoalTarget(END, TOLERANCE, LARGEST_STD))
 
     begin = time.thread_time()
     plan, errors = best_plan(
-        make, lambda plan: rehearse(plan, rng), lambda errors: -float(errors.max()),
-        ATTEMPTS if task.robust else 1,
+        make, lambda plan: rehearse(plan, rng), _score, ATTEMPTS if task.robust else 1
     )  # fmt: skip
     assert plan.trajectory is not None, "the disc does not begin at its goal"
-    near, worst = float(np.mean(errors < 0.02)), float(errors.max())
+    near, worst = float(np.mean(errors < NEAR)), float(errors.max())
     return PlanResult(plan.trajectory, plan.reached, time.thread_time() - begin, near, worst)
 
 
@@ -145,9 +151,17 @@ def rehearse(plan: RobustPlan, rng: np.random.Generator) -> NDArray[np.float64]:
     assert motion is not None, "the disc does not begin at its goal"
     times = np.linspace(motion.start_time, motion.end_time, int(motion.duration / 0.02) + 2)
     judged = FRICTION.dynamics(RADIUS, TOOL_KINDS["hand"].effectors)
-    believed = disc_belief(BEGIN, PLACE_STD, RADIUS, ROLLOUTS, rng)
-    final = judged.simulate(believed, motion(times), rng).belief
+    final = judged.simulate(_believed(ROLLOUTS, PLACE_STD, rng), motion(times), rng).belief
     return np.linalg.norm(final.poses[:, :2] - END, axis=1)
+
+
+def _believed(count: int, std: float, rng: np.random.Generator) -> ObjectBelief:
+    return disc_belief(BEGIN, std, RADIUS, count, rng, friction=PUSHED_FRICTION)
+
+
+def _score(errors: NDArray) -> float:
+    """Fewer failures are better; among equals, smaller errors."""
+    return float(np.mean(errors < NEAR)) - float(np.mean(errors))
 
 
 def reach_both_ways(points: NDArray) -> NDArray[np.bool_]:
@@ -267,8 +281,8 @@ def plan_table(
 ) -> str:
     """Plans and how often they could be repeated."""
     header = [
-        "plan", "duration", "planning", "rollouts within 2 cm", "worst rollout", "pushes, mean (min-max)",
-        "largest error",
+        "plan", "duration", "planning", f"rollouts within {100 * NEAR:.0f} cm", "worst rollout",
+        "pushes, mean (min-max)", "largest error",
     ]  # fmt: skip
     rows = []
     for task, plan in zip(plan_tasks, plans, strict=True):
