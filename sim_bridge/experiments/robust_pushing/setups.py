@@ -20,7 +20,8 @@ from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
 BIMANUAL = RobustPushingConfig(jitter=0.004, executed=16)
 HAND = RobustPushingConfig(
     points=3, steps=60, executed=20, particles=40, jitter=0.004, variance_weight=10.0, duration_weight=0.05,
-    speed=0.15, acceleration=0.7, turn_speed=1.2, search=VpstoConfig(population=30, iterations=20, strategy="cma"),
+    speed=0.15, acceleration=0.7, turn_speed=1.2,
+    search=VpstoConfig(population=30, iterations=20, strategy="cma"),
 )  # fmt: skip
 
 STRAIGHT_HAND = dataclasses.replace(
