@@ -17,6 +17,7 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from vpsto_ros.belief.particles import ObjectBelief
 from vpsto_ros.estimation.measurement import MeasurementLimits
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.planar_kalman import PlanarKalmanConfig
@@ -460,10 +461,10 @@ def start_moving(bench):
 def test_both_arms_are_planned_for_and_a_controller_could_follow(planner):
     planner.advance(0.5, each=drive(planner))
     goal(planner)
-    planner.advance(1.5, each=drive(planner))
+    planner.advance(1.1, each=drive(planner))
     assert planner.node.last.valid, planner.node.last.message
     messages = planner.received["joint_trajectory"]
-    assert len(messages) >= 15
+    assert len(messages) >= 10
     previous = None
     for message in messages:
         trajectory = trajectory_from_message(message)
@@ -579,8 +580,10 @@ def test_contact_plans_are_used_when_they_are_whole_and_fresh(planner):
     assert used[-1] is None, "half a plan is none"
     planner.send("contact_plan", right)
     planner.advance(0.1, each=drive(planner))
-    mean, covariance = used[-1]
-    assert np.allclose(mean, START + [0.05, 0.0, 0.05, 0.0]) and np.allclose(covariance, 1e-4 * np.eye(4))
+    planned = used[-1]
+    assert np.allclose(planned.mean, START + [0.05, 0.0, 0.05, 0.0])
+    assert np.allclose(planned.covariance, 1e-4 * np.eye(4))
+    np.testing.assert_allclose(planned.place, PLACE[:2], atol=0.002)
     planner.send("contact_plan", plan(planner, shift=0.01)[0])
     planner.advance(0.1, each=drive(planner))
     assert used[-1] is None, "halves of two plans are none either"
@@ -676,13 +679,14 @@ def test_a_restarted_planner_takes_over_arms_that_stand(bench, planner):
         (lambda: MpcPlannerConfig(robot=BALLS), ("robot.kind = 'two_balls'", "robust_pushing")),
         (lambda: ContactPlannerNodeConfig(robot=HAND), ("robot.kind = 'hand'", "robust_pushing")),
         (
-            lambda: MpcPlannerConfig(kind="robust_pushing", goal_orientation="use"),
+            lambda: MpcPlannerConfig(kind="robust_pushing", robot=BALLS, goal_orientation="use"),
             ("goal_orientation = 'use'", "kind = 'pushing'"),
         ),
         (
-            lambda: MpcPlannerConfig(kind="robust_pushing", deadline=0.047, reserve=0.0),
+            lambda: MpcPlannerConfig(kind="robust_pushing", robot=BALLS, deadline=0.047, reserve=0.0),
             ("deadline = 0.047", "robust.lead = 0.05"),
         ),
+        (lambda: MpcPlannerConfig(kind="robust_pushing"), ("robot.kind = 'rod'", "'two_balls'", "'pushing'")),
         (lambda: RobotConfig("three_balls"), ("'three_balls'", "'rod', 'hand', 'two_balls'")),
         (lambda: RobotConfig("two_balls", 1.0).plane(), ("robot.tool_height = 1", "two_balls")),
         (lambda: BeliefModelConfig(friction=(0.5, 0.1)), ("friction = [0.5, 0.1]",)),
@@ -706,17 +710,18 @@ def test_an_object_too_small_for_two_tools_is_refused_by_name(bench):
         bench(ContactPlannerNode, "contact_planner", **{**ROBUST, "model__object__size": [0.04, 0.04]})
 
 
-@pytest.mark.parametrize("kind", ["rod", "hand"])
-def test_other_robots_push_robustly_as_well(bench, kind):
-    made = bench(MpcPlannerNode, "mpc_planner", kind="robust_pushing", robot__kind=kind, **CAN)
+def test_the_hand_brings_an_object_nearer_to_its_goal(bench):
+    """The can moves as the nominal model says; with one flat side variance must be allowed to grow."""
+    options = {"kind": "robust_pushing", "robot.kind": "hand", "robust.planning.largest_gain": 10.0}
+    made = bench(MpcPlannerNode, "mpc_planner", **options, **CAN)
     made.node.deadline = 60.0
     for message, topic in KNOWN:
         made.talk(message, topic)
     made.listen(JointTrajectory, "joint_trajectory")
     made.connect()
-    tools = RobotConfig(kind).plane()
-    point = np.array([0.36, 0.0, 0.5 * np.pi][: tools.dof])
-    q, made.running = tools.joints(point[None])[0], None
+    tools, known = HAND.plane(), made.node.task.planner.pusher
+    point = np.array([0.36, 0.0, 0.5 * np.pi])
+    q, made.running, can = tools.joints(point[None])[0], None, [PLACE, point]
 
     def each(t):
         if made.received["joint_trajectory"]:
@@ -724,10 +729,12 @@ def test_other_robots_push_robustly_as_well(bench, kind):
         position = q if made.running is None else made.running(t)
         velocity = None if made.running is None else made.running(t, 1)
         made.send("joint_states", joints(made, position, velocity, names=JOINT_NAMES))
-        made.send("object_belief", belief(made))
+        here = tools.tool(position)
+        one = ObjectBelief(np.tile(can[0], (2, 1)))
+        can[:] = known._quiet.simulate(one, np.stack([can[1], here]), known.rng).belief.mean, here
+        made.send("object_belief", belief(made, place=can[0]))
 
     made.advance(0.5, each=each)
-    goal(made)
-    made.advance(1.2, each=each)
-    assert made.node.last.valid, made.node.last.message
-    assert speed(made) > 0.0
+    goal(made, 0.56, 0.0)
+    made.advance(4.0, each=each)
+    assert np.hypot(*(can[0][:2] - [0.56, 0.0])) < np.hypot(*(PLACE[:2] - [0.56, 0.0])) - 0.03

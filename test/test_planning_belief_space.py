@@ -536,7 +536,7 @@ def test_without_any_valid_candidate_the_robot_brakes():
     velocity = np.array([0.1, 0.02, 0.1, -0.02])
     step = planner.horizon(START, velocity, belief(), CIRCLE.way(0.0), start_time=2.0)
     assert not step.valid and step.trajectory.start_time == 2.0
-    assert step.execute == pytest.approx(step.trajectory.duration)
+    assert planner.executed_time(step) == pytest.approx(step.trajectory.duration)
     np.testing.assert_allclose(step.trajectory(step.trajectory.end_time, 1), 0.0, atol=1e-12)
     plan = planner.plan(START, belief(), CIRCLE, velocity=velocity, horizons=4)
     assert not plan.reached and plan.horizons == plan.violating == 4

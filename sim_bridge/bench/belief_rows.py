@@ -51,9 +51,10 @@ def problems(joints: bool, model: Model, particles: int, steps: int) -> list[Rob
                 belief=belief.jittered(config.jitter, rng), way=target.way(progress), reach=planner.reach,
             )
         )  # fmt: skip
-        path = step.trajectory(np.linspace(0.0, step.execute, 13))
+        executed = planner.executed_time(step)
+        path = step.trajectory(np.linspace(0.0, executed, 13))
         belief = planner.dynamics.simulate(belief, planner.space.plane(path[None])[0][0], rng).belief
-        position, velocity, _ = step.trajectory.state(step.execute)
+        position, velocity, _ = step.trajectory.state(executed)
         progress = target.advanced(progress, belief.mean[:2])
     return found
 

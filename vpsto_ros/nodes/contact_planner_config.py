@@ -6,7 +6,7 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import PUSHING, TASKS, RobotConfig, check_task
 from vpsto_ros.nodes.scene import ModelConfig
-from vpsto_ros.planning.belief_space.config import RobustMpcConfig
+from vpsto_ros.planning.belief_space.config import RobustContactPlannerConfig
 from vpsto_ros.planning.contact import ContactPlannerConfig
 from vpsto_ros.planning.workspace import Workspace
 
@@ -36,7 +36,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
     workspace: Workspace = dataclasses.field(default_factory=Workspace)
     planner: ContactPlannerConfig = dataclasses.field(default_factory=ContactPlannerConfig)
-    robust: RobustMpcConfig = dataclasses.field(default_factory=RobustMpcConfig)
+    robust: RobustContactPlannerConfig = dataclasses.field(default_factory=RobustContactPlannerConfig)
 
     def __post_init__(self) -> None:
         validate(self)

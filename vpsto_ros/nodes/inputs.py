@@ -14,7 +14,7 @@ from vpsto_ros.nodes.contact_conversions import EffectorContact, gather_contacts
 from vpsto_ros.nodes.conversions import read_belief, read_goal
 from vpsto_ros.nodes.lifecycle import ManagedNode
 from vpsto_ros.nodes.robots import BeliefModelConfig
-from vpsto_ros.planning.belief_space.mpc import StampedBelief
+from vpsto_ros.planning.belief_space.mpc import PlannedContact, StampedBelief
 from vpsto_ros.planning.belief_space.targets import GoalTarget
 from vpsto_ros.planning.goal import PlanarGoal
 
@@ -141,10 +141,12 @@ class ContactInput:
     """
 
     def __init__(
-        self, node: ManagedNode, frame: str, effectors: EndEffectors, tool_frames: tuple[str, ...]
-    ) -> None:
-        """Listen."""
+        self, node: ManagedNode, frame: str, effectors: EndEffectors, tool_frames: tuple[str, ...],
+        belief: BeliefInput,
+    ) -> None:  # fmt: skip
+        """Listen; `belief` says where the object was when a plan came."""
         self._node, self._frame, self._effectors, self._tool_frames = node, frame, effectors, tool_frames
+        self._belief = belief
         self.forget()
         node.subscribe(Odometry, "contact_plan", self.receive)
 
@@ -152,6 +154,7 @@ class ContactInput:
         """Forget all plans."""
         self.received = -math.inf
         self._plans: dict[str, EffectorContact] = {}
+        self._place: NDArray | None = None
 
     def receive(self, message: Odometry) -> None:
         """Take the plan of one end effector.
@@ -165,10 +168,13 @@ class ContactInput:
             message, self._node.time_base, self._frame, self._effectors, self._tool_frames
         )
         self._plans[plan.tool] = plan
+        known = self._belief.latest
+        self._place = None if known is None else known.belief.mean[:2]
         self.received = self._node.clock_seconds()
 
-    def fresh(self, now: float, timeout: float) -> tuple[NDArray, NDArray] | None:
-        """Mean (m,) and covariance (m, m) of the plane coordinates; None if one is missing or all are old."""
-        if now - self.received > timeout:
+    def fresh(self, now: float, timeout: float) -> PlannedContact | None:
+        """The contact of all end effectors; None if one is missing or all are old."""
+        if now - self.received > timeout or self._place is None:
             return None
-        return gather_contacts(self._plans, self._effectors, self._tool_frames)
+        gathered = gather_contacts(self._plans, self._effectors, self._tool_frames)
+        return None if gathered is None else PlannedContact(*gathered, self._place)

@@ -153,7 +153,8 @@ class MpcPlannerNode(ManagedNode):
             return STALE, step.message
         if step.mode == "brake":
             return ERROR if step.message.startswith("plan refused") else WARN, step.message
-        return (WARN, trouble) if trouble else (OK, step.message)
+        said = f"{step.message}; {step.warning}" if step.warning else step.message
+        return (WARN, trouble or said) if trouble or step.warning else (OK, said)
 
     def _ages(self, now: float) -> dict[str, str]:
         joints = self.arm.joints

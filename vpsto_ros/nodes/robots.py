@@ -11,9 +11,11 @@ from vpsto_ros.contact.end_effectors import EndEffectors
 from vpsto_ros.contact.geometry import Disc
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.nodes.scene import ModelConfig
-from vpsto_ros.planning.belief_space.config import RobustPushingConfig
-from vpsto_ros.planning.belief_space.contacts import ContactRule, CrossingRule
+from vpsto_ros.planning.belief_space.config import RobustContactConfig
+from vpsto_ros.planning.belief_space.contacts import ContactRule
+from vpsto_ros.robot.bimanual_plane import LEAST_DISTANCE
 from vpsto_ros.robot.kinds import TOOL_KINDS, ToolKind
+from vpsto_ros.robot.tip_kinematics import BALL_RADIUS
 from vpsto_ros.robot.tool_plane import ToolPlane
 
 PUSHING, ROBUST_PUSHING = "pushing", "robust_pushing"
@@ -29,7 +31,7 @@ class RobotConfig:
     kind: str = option("rod", "robot with its tools", choices=tuple(TOOL_KINDS))
     tool_height: float = option(
         0.0,
-        "height of the tips above the table; 0 takes the usual one, "
+        "height of the tips above the table (kind = pushing has planner.tool_height); 0 takes the usual one, "
         + ", ".join(f"{kind.height:g} for {name}" for name, kind in TOOL_KINDS.items()),
         unit="m",
         minimum=0.0,
@@ -64,6 +66,11 @@ def check_task(kind: str, robot: RobotConfig, goal_orientation: str) -> None:
     if kind == PUSHING and robot.kind != "rod":
         raise ConfigurationError(
             f"robot.kind = '{robot.kind}' needs kind = '{ROBUST_PUSHING}'; kind = '{PUSHING}' moves the rod"
+        )
+    if kind == ROBUST_PUSHING and robot.kind == "rod":
+        raise ConfigurationError(
+            f"kind = '{ROBUST_PUSHING}' needs tools that gather what is uncertain, robot.kind = 'two_balls' "
+            f"or 'hand'; robot.kind = 'rod' only spreads it: use kind = '{PUSHING}'"
         )
     if kind == ROBUST_PUSHING and goal_orientation == "use":
         raise ConfigurationError(
@@ -116,15 +123,21 @@ def belief_dynamics(robot: RobotConfig, model: ModelConfig, way_variance: float)
     )  # type: ignore[arg-type]  # fmt: skip
 
 
-def contact_rule(robot: RobotConfig, model: ModelConfig, planning: RobustPushingConfig) -> ContactRule:
+def contact_rule(robot: RobotConfig, model: ModelConfig, planning: RobustContactConfig) -> ContactRule:
     """Where the tools of a robot touch an object.
 
     Raises:
-        ConfigurationError: side by side behind the object, the tools would touch each other.
+        ConfigurationError: side by side behind the object, the tools would touch each other; or they may
+            come nearer to each other than their arms can.
     """
-    effectors, shape = effectors_of(robot, model), model.object.shape()
-    crossing = CrossingRule() if robot.kind == "two_balls" else None
-    rule = ContactRule(effectors, shape, planning.contact_angle, planning.contact_advance, crossing)
+    effectors, shape, two_arms = effectors_of(robot, model), model.object.shape(), robot.tools.two_arms
+    rule = ContactRule.of(planning, effectors, shape, two_arms=two_arms)
+    least = LEAST_DISTANCE - 2.0 * BALL_RADIUS
+    if two_arms and planning.separation < least - 1e-9:
+        raise ConfigurationError(
+            f"separation = {planning.separation:g} m lets the arms of robot.kind = '{robot.kind}' touch; at "
+            f"least {least:g} m is needed"
+        )
     gap = _narrowest_gap(rule)
     if gap < planning.separation:
         raise ConfigurationError(

@@ -27,8 +27,9 @@ class RobustPushingTask:
         self.planner.warm_up()
         frame, robust = config.base_frame, config.robust
         self.goal = TargetInput(node, frame, robust.workspace_x, robust.workspace_y)
-        self.belief = BeliefInput(node, frame, config.belief, rng)
-        self.contact = ContactInput(node, frame, dynamics.effectors, config.robot.tools.frames)
+        # Its own randomness: plans must not depend on how many messages came.
+        self.belief = BeliefInput(node, frame, config.belief, rng.spawn(1)[0])
+        self.contact = ContactInput(node, frame, dynamics.effectors, config.robot.tools.frames, self.belief)
 
     def forget(self) -> None:
         """Forget what carries a time; the goal stays."""

@@ -45,7 +45,12 @@ class ModelConfig:
 
     object: ShapeConfig = dataclasses.field(default_factory=ShapeConfig)
     tool_radius: float = option(0.015, "radius of the pushing rod", unit="m", minimum=0.001, maximum=0.2)
-    friction: float = option(0.3, "friction coefficient between tool and object", minimum=0.0, maximum=2.0)
+    friction: float = option(
+        0.3,
+        "friction coefficient between tool and object, for kind = pushing and kalman; beliefs have ranges",
+        minimum=0.0,
+        maximum=2.0,
+    )
     pressure_radius: float = option(
         0.0, "radius of the pressure distribution; 0 takes an even one", unit="m", minimum=0.0, maximum=1.0
     )

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.planning.pushing import AT_REST as MEASURED_REST
+from vpsto_ros.planning.running_reference import AT_REST as MEASURED_REST
 from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.planning.stitching import extended
 from vpsto_ros.trajectory import Limits, Trajectory, braking_trajectory

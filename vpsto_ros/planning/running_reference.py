@@ -40,6 +40,7 @@ class MpcStep:
         iterations: iterations of the search.
         plane: solution in the plane, for the next warm start.
         ready_at: nothing is planned before this time [s].
+        warning: what works less well than it should, in words, if anything.
         spread: standard deviation of the predicted object position, shape (K,) [m], if it was predicted.
     """
 
@@ -54,6 +55,7 @@ class MpcStep:
     plane: Trajectory | None = None
     ready_at: float = -np.inf
     spread: NDArray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    warning: str = ""
 
 
 class ReferencePlanner(abc.ABC):

@@ -111,7 +111,7 @@ class BimanualPlane:
         return q, qd, qdd
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Whether both balls, shape (..., 4), are within reach and joint limits, margin [m] from the ends."""
+        """Whether both balls, (..., 4), are within joint limits and in reach, margin [m] from its ends."""
         points = np.asarray(points, dtype=float)
         inside = np.empty(points.shape[:-1], dtype=bool)
         rows = np.ascontiguousarray(points).reshape(-1, 4)

@@ -24,6 +24,7 @@ class ToolKind:
         height: at which its tools usually are above the table [m].
         effectors: its tools seen from above.
         frames: what messages call the tools, in the order of their plane coordinates.
+        two_arms: whether each of two tools is on an arm of its own.
     """
 
     load: Callable[[], Robot]
@@ -31,6 +32,7 @@ class ToolKind:
     height: float
     effectors: EndEffectors
     frames: tuple[str, ...]
+    two_arms: bool = False
 
 
 TOOL_KINDS = {
@@ -41,6 +43,6 @@ TOOL_KINDS = {
     ),
     "two_balls": ToolKind(
         fr3_bimanual, BimanualPlane, 0.035, EndEffectors.discs(BALL_RADIUS, 2),
-        ("left_fr3_tool", "right_fr3_tool"),
+        ("left_fr3_tool", "right_fr3_tool"), two_arms=True,
     ),
 }  # fmt: skip

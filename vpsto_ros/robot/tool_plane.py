@@ -44,7 +44,7 @@ class ToolPlane(Protocol):
         """Plane velocities (..., m) for joint positions and velocities (..., n)."""
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Whether plane points (..., m) are within reach and joint limits, margin [m] from the ends."""
+        """Whether plane points (..., m) are within joint limits and in reach, margin [m] from its ends."""
 
     def tips(self, q: ArrayLike) -> NDArray[np.float64]:
         """Positions (..., tools, 3) [m] of the tips for joint positions (..., n) [rad]."""

@@ -58,6 +58,8 @@ TOOL_FRICTION = (0.0, 0.5)
 SHOWN = (1, 10, 40, 120)
 """Iterations after which the best candidate of the single horizon is shown and judged."""
 ROLLOUTS, STEP = 1000, 0.05
+EXECUTED = 20
+"""Steps that are executed of a horizon."""
 HORIZONS, TRACKED = 300, 200
 """Horizons that are allowed, and particles with which the belief is carried from one to the next."""
 REQUIRED = {"single_horizon": 0.95, "receding": 0.99}
@@ -72,7 +74,7 @@ def config_of(way: str, model: Model, robust: bool) -> RobustPushingConfig:
         "search": VpstoConfig(population=30, iterations=iterations, strategy="cma"),
     }  # fmt: skip
     if way == "receding":
-        return RobustPushingConfig(executed=20, **common)
+        return RobustPushingConfig(**common)
     return RobustPushingConfig(
         points=4, steps=50, smoothness_spread=0.1, distance_weight=20.0, duration_weight=0.05, **common
     )
@@ -115,9 +117,9 @@ class Plan:
 def planner(task: Task, rng: np.random.Generator) -> RobustPusher:
     """The planner of a task."""
     config = config_of(task.way, MODELS[task.model], task.robust)
-    rule = ContactRule(HAND, PlanarShape.disc(RADIUS), config.contact_angle, config.contact_advance)
+    rule = ContactRule.of(config, HAND, PlanarShape.disc(RADIUS))
     dynamics = MODELS[task.model].dynamics(RADIUS, HAND)
-    return RobustPusher(config, dynamics, PlaneSpace(HAND, config), rule, rng)
+    return RobustPusher(config, dynamics, PlaneSpace(HAND, config), rule, rng, executed=EXECUTED)
 
 
 def belief(count: int, rng: np.random.Generator) -> ObjectBelief:

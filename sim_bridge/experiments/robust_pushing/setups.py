@@ -17,9 +17,9 @@ from vpsto_ros.planning.belief_space.config import RobustPushingConfig
 from vpsto_ros.planning.belief_space.problem import Reach
 from vpsto_ros.planning.belief_space.receding_horizon import RobustPusher
 
-BIMANUAL = RobustPushingConfig(jitter=0.004, executed=16)
+BIMANUAL = RobustPushingConfig(jitter=0.004)
 HAND = RobustPushingConfig(
-    points=3, steps=60, executed=20, particles=40, jitter=0.004, variance_weight=10.0, duration_weight=0.05,
+    points=3, steps=60, particles=40, jitter=0.004, variance_weight=10.0, duration_weight=0.05,
     speed=0.15, acceleration=0.7, turn_speed=1.2,
     search=VpstoConfig(population=30, iterations=20, strategy="cma"),
 )  # fmt: skip
@@ -30,8 +30,8 @@ STRAIGHT_HAND = dataclasses.replace(
 """The deterministic plan of the thesis is straight, the long side across. Left to itself the baseline swings
 the hand, which moves the object faster than the hand's speed limit and loses it in the first push."""
 
-CONFIGS = {"two_balls": BIMANUAL, "hand": HAND}
-"""The usual options by the name of the robot."""
+CONFIGS = {"two_balls": (BIMANUAL, 16), "hand": (HAND, 20)}
+"""The usual options, and steps H that are executed of a horizon, by the name of the robot."""
 
 
 def pusher(
@@ -49,8 +49,9 @@ def pusher(
         config: options instead of the usual ones for this robot.
         reach: where the tools may be, instead of wherever the robot reaches.
     """
-    config = dataclasses.replace(config or CONFIGS[robot], robust=robust)
-    return robot_pusher(robot, radius, MODELS[model], config, rng, reach=reach)
+    usual, executed = CONFIGS[robot]
+    config = dataclasses.replace(config or usual, robust=robust)
+    return robot_pusher(robot, radius, MODELS[model], config, rng, reach=reach, executed=executed)
 
 
 def random_plant(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.belief.particles import ObjectBelief
-from vpsto_ros.planning.belief_space.config import RobustPushingConfig
+from vpsto_ros.planning.belief_space.config import RobustContactConfig
 from vpsto_ros.planning.belief_space.contacts import ContactRule
 from vpsto_ros.planning.belief_space.targets import Target
 from vpsto_ros.priors.contact import contact_distribution
@@ -33,7 +33,7 @@ class RobustContactPlan:
 class RobustContactPlanner:
     """Places end effectors behind a belief as seen from its target."""
 
-    def __init__(self, config: RobustPushingConfig, rule: ContactRule) -> None:
+    def __init__(self, config: RobustContactConfig, rule: ContactRule) -> None:
         self.config, self.rule = config, rule
 
     def plan(self, now: float, present: NDArray, belief: ObjectBelief, target: Target) -> RobustContactPlan:
@@ -57,7 +57,7 @@ class RobustContactPlanner:
 
 
 def likely_contact(
-    config: RobustPushingConfig, rule: ContactRule, belief: ObjectBelief, present: NDArray, along: NDArray
+    config: RobustContactConfig, rule: ContactRule, belief: ObjectBelief, present: NDArray, along: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Mean (m,) and covariance (m, m) of the plane coordinates in contact, eq. (6.38).
 

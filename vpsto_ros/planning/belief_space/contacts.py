@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.contact.end_effectors import EndEffectors
 from vpsto_ros.contact.geometry import Disc, PlanarShape
+from vpsto_ros.planning.belief_space.config import RobustContactConfig
 from vpsto_ros.robot.bimanual_plane import CROSSED_OFFSET, LARGEST_CROSSING
 
 
@@ -54,6 +55,19 @@ class ContactRule:
     angle: float
     advance: float
     crossing: CrossingRule | None = None
+
+    @classmethod
+    def of(
+        cls,
+        config: RobustContactConfig,
+        effectors: EndEffectors,
+        shape: PlanarShape,
+        *,
+        two_arms: bool = False,
+    ) -> "ContactRule":
+        """The rule that options mean; end effectors on two arms may not cross."""
+        crossing = CrossingRule() if two_arms else None
+        return cls(effectors, shape, config.contact_angle, config.contact_advance, crossing)
 
     def configuration(self, pose: ArrayLike, direction: ArrayLike, present: ArrayLike) -> NDArray[np.float64]:
         """f_c: plane coordinates (m,) from which to push an object at a pose (3,) along a direction (2,).

@@ -6,6 +6,7 @@ until the new one takes over; what is left of it is a candidate of the new searc
 
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable
 
@@ -29,6 +30,9 @@ from vpsto_ros.trajectory import OptimalBasis, Trajectory, braking_trajectory, s
 _BELIEF_STEP = 0.02  # time between samples of the reference when a belief is carried on [s]
 _KNOTS = 0.06  # between knots of a joint trajectory [s]: within a micrometre of the plane's motion
 _REACH_MARGIN = 0.003  # by which searched motions stay within reach: so that brakes do, too [m]
+_NEARER = 0.002  # that an object must come nearer to its goal to count as progress [m]
+_MOVED = 0.02  # what an object moves in a cycle when somebody else moves it [m]
+_JUMP = 1e-3  # that the reference may make where a motion takes over: after a stop tools may tilt [rad]
 _MODES = {True: "robust", False: "deterministic"}
 
 
@@ -38,6 +42,21 @@ class StampedBelief:
 
     stamp: float
     belief: ObjectBelief
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedContact:
+    """Where to touch, as somebody planned it for an object that has moved since.
+
+    Attributes:
+        mean: of the plane coordinates in contact, shape (m,).
+        covariance: of these, shape (m, m).
+        place: mean position of the object that it was planned for, shape (2,) [m].
+    """
+
+    mean: NDArray
+    covariance: NDArray
+    place: NDArray
 
 
 class RobustPushingMpc(ReferencePlanner):
@@ -86,6 +105,7 @@ class RobustPushingMpc(ReferencePlanner):
         super().reset()
         self.holding, self._progress = False, 0.0
         self._target: Target | None = None
+        self._nearest, self._nearest_at, self._left = math.inf, math.inf, math.inf
 
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
@@ -104,7 +124,7 @@ class RobustPushingMpc(ReferencePlanner):
         joint_velocity: NDArray,
         belief: StampedBelief | None,
         target: Target | None,
-        contact: tuple[NDArray, NDArray] | None = None,
+        contact: PlannedContact | None = None,
         *,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
@@ -117,8 +137,7 @@ class RobustPushingMpc(ReferencePlanner):
             joint_velocity: measured joint velocities, shape (n,) [rad/s].
             belief: latest belief over the object, None if there is none.
             target: where to push it, None if nobody said.
-            contact: where to touch, as mean (m,) and covariance (m, m) of the plane coordinates; None: by the
-                planner's own rule.
+            contact: where to touch, moved along with the object; None: by the planner's own rule.
             deadline: value of `clock` at which to return the best found so far.
             clock: source of that time.
         """
@@ -128,38 +147,56 @@ class RobustPushingMpc(ReferencePlanner):
             return self._begin(now, joint_position, joint_velocity)
         if now + self.config.lead < self.ready_at:
             return MpcStep(None, "wait", False, "about to begin")
+        offset = self._observe_offset(now, joint_position)
+        if self._distance(offset) > self.config.largest_offset:
+            return self._let_go(now, offset)
         problem = self._reason_to_stop(now, belief, target)
         if problem or belief is None or target is None:
             return self._stop(now, "brake", problem)
-        pressed = self._observe_offset(now, joint_position)
-        if np.abs(pressed).max() > self.config.largest_offset:
-            return self._let_go(now, pressed)
         ahead = self._carried(belief, now + self.config.lead)
-        if self._reached(target, ahead):
+        if self._reached(now, target, ahead):
             return self._stop(now, "hold", "the object is at its goal", valid=True)
         position, velocity = self._tools_at(now + self.config.lead)
         horizon = self.pusher.horizon(
             position, velocity, ahead, target.way(self._progress), start_time=now + self.config.lead,
-            previous=self._plane, contact=contact, tool_offset=self.tool_offset, deadline=deadline,
-            clock=clock,
+            previous=self._plane, contact=self._moved(contact, ahead), tool_offset=self.tool_offset,
+            deadline=deadline, clock=clock,
         )  # fmt: skip
         if not horizon.valid:
             return self._stop(now, "brake", "no valid plan found")
         try:
-            return self._joint_step(now, horizon)
+            return dataclasses.replace(self._joint_step(now, horizon), warning=self._impatience(now))
         except InfeasibleError as error:
             return self._stop(now, "brake", f"plan refused: {error}")
 
     def warm_up(self) -> None:
         """Compile every kernel by planning once for an imaginary object."""
-        (low_x, high_x), (low_y, high_y) = self.config.workspace_x, self.config.workspace_y
-        pose = np.array([0.5 * (low_x + high_x), 0.5 * (low_y + high_y), 0.0])
+        pose, start = self._reachable_push()
         belief = ObjectBelief.gaussian(pose, 0.003, self.config.planning.particles, np.random.default_rng(0))
-        start = self.pusher.rule.configuration(pose, np.array([1.0, 0.0]), np.zeros(self.tools.dof))
-        start[0::2] -= 0.1 if self.tools.dof != 3 else 0.0
         horizon = self.pusher.horizon(start, np.zeros(self.tools.dof), belief, np.array([[*pose[:2], 0.0]]))
         follow_plane(horizon.trajectory, self.tools)
         self._carried_along(belief, np.stack([start, start]))
+
+    def _reachable_push(self) -> tuple[NDArray, NDArray]:
+        """A pose (3,) in the workspace and plane coordinates (m,) behind it that are within reach.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        config, rule = self.config, self.pusher.rule
+        x, y = np.meshgrid(np.linspace(*config.workspace_x, 9), np.linspace(*config.workspace_y, 9))
+        poses = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+        middle = np.array([np.mean(config.workspace_x), np.mean(config.workspace_y), 0.0])
+        for pose in poses[np.argsort(np.linalg.norm(poses - middle, axis=1), kind="stable")]:
+            start = rule.configuration(pose, np.array([1.0, 0.0]), np.zeros(self.tools.dof))
+            for column in rule.effectors.columns:
+                start[column] -= 2.0 * config.planning.contact_advance
+            if self.tools.contains(start[None])[0]:
+                return pose, start
+        raise ConfigurationError(
+            f"workspace_x = {config.workspace_x}, workspace_y = {config.workspace_y} m: nowhere in there can "
+            "the tools get behind an object; move it nearer to where the arms reach"
+        )
 
     def _begin(self, now: float, position: NDArray, velocity: NDArray) -> MpcStep:
         """Take over arms that stand still with their tools in the plane."""
@@ -212,21 +249,45 @@ class RobustPushingMpc(ReferencePlanner):
         times = np.minimum(np.linspace(begin, when, count), self._running.end_time)
         return self._carried_along(belief.belief, self.tools.tool(self._running(times)) + self.tool_offset)
 
+    def _distance(self, offset: NDArray) -> float:
+        """How far a tool is moved at most by plane coordinates (m,), turning apart [m]."""
+        return float(np.hypot(*self.pusher.rule.effectors.poses(offset)[:, :2].T).max())
+
+    def _moved(
+        self, contact: PlannedContact | None, belief: ObjectBelief
+    ) -> tuple[NDArray, NDArray] | None:
+        """A contact where the object is by then, (6.38)."""
+        if contact is None:
+            return None
+        moved = self.pusher.rule.jacobian() @ (belief.mean[:2] - contact.place)
+        return contact.mean + moved, contact.covariance
+
+    def _impatience(self, now: float) -> str:
+        """What to say when the object comes no nearer to its goal."""
+        since = now - self._nearest_at
+        if since <= self.config.patience:
+            return ""
+        return f"the object has come no nearer to its goal for {since:.0f} s"
+
     def _tool(self, q: ArrayLike) -> NDArray[np.float64]:
         return self.tools.tool(q)
 
     def _carried_along(self, belief: ObjectBelief, path: NDArray) -> ObjectBelief:
         return self.pusher.dynamics.simulate(belief, path, self.rng).belief
 
-    def _reached(self, target: Target, belief: ObjectBelief) -> bool:
+    def _reached(self, now: float, target: Target, belief: ObjectBelief) -> bool:
         """Hysteresis: rest within the hold distance until the object is beyond the resume distance.
 
         A belief that is too wide is not at its goal, wherever its mean is.
         """
         if target is not self._target:
             self._target, self._progress, self.holding = target, 0.0, False
+            self._nearest, self._nearest_at, self._left = math.inf, now, math.inf
         self._progress = target.advanced(self._progress, belief.mean[:2])
         left = target.remaining(self._progress, belief.mean[:2])
+        if self.holding or left < self._nearest - _NEARER or left > self._left + _MOVED:
+            self._nearest, self._nearest_at = left, now
+        self._left = left
         within = self.config.resume_distance if self.holding else self.config.hold_distance
         self.holding = left <= within and belief.variance <= self.config.hold_std**2
         return self.holding
@@ -245,6 +306,9 @@ class RobustPushingMpc(ReferencePlanner):
         plane, start = horizon.trajectory, horizon.trajectory.start_time
         followed = follow_plane(plane, self.tools, spacing=_KNOTS, cubic=True)
         moving = np.abs(plane(start, 1)).max() > 1e-6
+        jump = np.abs(followed.trajectory(start) - self._running(start)).max()
+        if jump > _JUMP:
+            raise InfeasibleError(f"the arms are {jump:.4f} rad off the posture that holds the tools upright")
         if followed.stretch > 1.0 and moving:
             raise InfeasibleError(f"the joints' limits ask for a motion {followed.stretch:.2f} times slower")
         result = horizon.result
@@ -270,7 +334,7 @@ class RobustPushingMpc(ReferencePlanner):
             OptimalBasis.uniform(0), np.stack([position, self.tools.tool(self._running(now)) + offset]),
             velocity, np.zeros_like(position), self.pusher.space.limits, start_time=takeover,
         )  # fmt: skip
-        message = f"the tools are held {1e3 * np.abs(offset).max():.0f} mm off their reference; letting go"
+        message = f"the tools are held {1e3 * self._distance(offset):.0f} mm off their reference; letting go"
         try:
             followed = follow_plane(back, self.tools, spacing=_KNOTS, cubic=True)
         except InfeasibleError:

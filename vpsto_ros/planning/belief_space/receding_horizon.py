@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vpsto_ros.belief.dynamics import BeliefDynamics
 from vpsto_ros.belief.particles import ObjectBelief
-from vpsto_ros.exceptions import InfeasibleError
+from vpsto_ros.exceptions import ConfigurationError, InfeasibleError
 from vpsto_ros.optimization.progress import SearchResult
 from vpsto_ros.optimization.vpsto import search
 from vpsto_ros.planning.belief_space.config import RobustPushingConfig
@@ -26,6 +26,8 @@ from vpsto_ros.trajectory import Trajectory, braking_trajectory
 
 MAX_HORIZONS = 500
 """Horizons after which the thesis gives up (6.6.3)."""
+EXECUTED = 12
+"""Steps H of a horizon after which a plan made offline is continued anew."""
 STILL = 1e-9
 """Speed below which there is nothing to brake, in units of the search space per second: round-off."""
 
@@ -39,14 +41,12 @@ class Horizon:
     Attributes:
         trajectory: motion in the search space from the present state to rest.
         valid: whether it keeps all constraints; if not, it brakes.
-        execute: how long it is executed before planning anew [s].
         result: of the search.
         problem: what was solved.
     """
 
     trajectory: Trajectory
     valid: bool
-    execute: float
     result: SearchResult
     problem: RobustPushingProblem
 
@@ -95,8 +95,27 @@ class RobustPusher:
         rng: np.random.Generator,
         *,
         reach: Reach | None = None,
+        executed: int = EXECUTED,
     ) -> None:
-        """Set up the planner; see :class:`RobustPushingProblem` for the arguments."""
+        """Set up the planner; see :class:`RobustPushingProblem` for the other arguments.
+
+        Args:
+            config: options.
+            dynamics: of the belief.
+            space: what is searched.
+            rule: where to touch.
+            rng: source of randomness.
+            reach: tells which plane coordinates the arms reach.
+            executed: steps H of a horizon after which :meth:`plan` plans anew.
+
+        Raises:
+            ConfigurationError: H is not from 1 to the number of steps.
+        """
+        if not 1 <= executed <= config.steps:
+            raise ConfigurationError(
+                f"executed = {executed}: a horizon of steps = {config.steps} is executed for 1 to as many"
+            )
+        self._executed = executed
         self.config, self.dynamics, self.space, self.rule = config, dynamics, space, rule
         self.rng, self.reach = rng, reach
         self._step_time = _STEP_TIME
@@ -143,9 +162,14 @@ class RobustPusher:
         if result.points is not None:
             motion = problem.trajectory(result.points)
             self._step_time = motion.duration / config.steps
-            return Horizon(motion, True, motion.duration * config.executed / config.steps, result, problem)
+            return Horizon(motion, True, result, problem)
         brake = braking_trajectory(start, velocity, self.space.limits, start_time=start_time)
-        return Horizon(brake, False, brake.duration, result, problem)
+        return Horizon(brake, False, result, problem)
+
+    def executed_time(self, horizon: Horizon) -> float:
+        """How long a horizon is executed before :meth:`plan` plans anew; a brake is to its end [s]."""
+        share = self._executed / self.config.steps if horizon.valid else 1.0
+        return share * horizon.trajectory.duration
 
     def plan(
         self,
@@ -186,7 +210,7 @@ class RobustPusher:
                 step = self.horizon(q, qd, belief, target.way(progress), start_time=now, previous=previous)
             except InfeasibleError:  # no arm reaches a place to touch the object any more
                 break
-            end = now + max(step.execute, 1e-3)
+            end = now + max(self.executed_time(step), 1e-3)
             piece = step.trajectory.clipped(now, min(end, step.trajectory.end_time))
             rollout = dynamics.simulate(belief, self._path(step.trajectory, now, end), self.rng)
             belief, now = rollout.belief, piece.end_time
