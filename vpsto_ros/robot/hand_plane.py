@@ -80,7 +80,7 @@ class HandPlane:
         return motion
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Whether (x, y, yaw), shape (..., 3), is within joint limits and in reach, margin [m] from its ends."""
+        """Whether (x, y, yaw), shape (..., 3), within joint limits and in reach, margin [m] from its ends."""
         points = np.asarray(points, dtype=float)
         pan = np.arctan2(points[..., 1], points[..., 0])
         turns = self._arm.within([0, 6], np.stack([pan, pan - points[..., 2]], axis=-1))
