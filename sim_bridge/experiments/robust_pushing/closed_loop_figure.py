@@ -28,11 +28,11 @@ def write(
     left.grid(alpha=0.3)
     sums = np.array([[sum(run.ways) for run in runs] for runs in (plain, robust)])
     middle.plot(*sums, "o", ms=4, color="0.3")
-    most = 1.05 * sums.max()
-    middle.plot([0.0, most], [0.0, most], color="0.6", lw=0.8)
+    ends = 0.9 * sums.min(), 1.1 * sums.max()
+    middle.plot(ends, ends, color="0.6", lw=0.8)
     middle.set(
         xlabel="deterministic: three ways [s]", ylabel="robust: three ways [s]",
-        xlim=(0, most), ylim=(0, most),
+        xscale="log", yscale="log", xlim=ends, ylim=ends,
         title="a point per pair; below the line robust is faster",
     )  # fmt: skip
     for run, colour in ((robust[0], _ROBUST), (plain[0], _PLAIN)):
