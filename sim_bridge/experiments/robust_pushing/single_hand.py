@@ -4,7 +4,8 @@ Three robust plans and three of the deterministic baseline are each repeated, at
 whose friction, mass and centre of mass no planner knows, on a slightly tilted table, with a little
 displacement between any two pushes. These disturbances were calibrated, on seeds from 1000 on, so that the
 baseline loses the object after five to nine pushes on average, as in the thesis (6.8). A robust plan is the
-shortest of ten that hold in its own noisy rollouts; the baseline, which knows of no noise, has nothing to choose by.
+shortest of ten that hold in their own noisy rollouts; the baseline, which knows of no noise, has nothing to
+choose by.
 """
 
 import argparse
