@@ -72,7 +72,9 @@ class ContactLog:
         """Surfaces that the puck touched in the last step."""
         return tuple(self._begun)
 
-    def observe(self, time: float, pose: NDArray, velocity: NDArray, mallet: Callable[[], MalletState]) -> None:
+    def observe(
+        self, time: float, pose: NDArray, velocity: NDArray, mallet: Callable[[], MalletState]
+    ) -> None:
         """Take in the contacts that MuJoCo found for the state at a time [s].
 
         Args:

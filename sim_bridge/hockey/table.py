@@ -24,7 +24,8 @@ MALLET_RADIUS = 0.04815
 MALLET_HALF_HEIGHT = 0.03
 MALLET_OFFSET = 0.0505  # from the universal joint down to the mallet's centre
 MALLET_MASS = 0.283  # [kg]
-JOINT_LINK_MASS = 0.1  # between the two hinges of the universal joint [kg]
+MALLET_COM_OFFSET = 0.0683  # from the universal joint down to the mallet's centre of mass
+MALLET_INERTIA = 0.005  # about its centre of mass, any axis [kg m²]; the hinges' gains damp it critically
 UNIVERSAL_JOINT_HEIGHT = 0.1645  # of the universal joint during play, base frame [m]
 
 _ORIGIN = np.array(TABLE_ORIGIN)
@@ -43,7 +44,7 @@ def to_base(points: ArrayLike) -> NDArray[np.float64]:
 
 
 def goal_at(point: ArrayLike) -> str | None:
-    """Which goal's mouth a point (2,) [m] of the base frame has passed: "far", "near" (the robot's) or None."""
+    """Which goal a point (2,) [m] of the base frame is in: "far", "near" (the robot's own) or None."""
     x, y = to_table(point)
     if abs(x) <= HALF_LENGTH or abs(y) >= GOAL_HALF_WIDTH:
         return None

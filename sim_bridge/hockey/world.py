@@ -21,7 +21,7 @@ from sim_bridge.limit_monitor import LimitMonitor
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryFollower
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.robot.iiwa import iiwa14
+from vpsto_ros.robot.iiwa import UNIVERSAL_JOINT, iiwa14
 
 CAMERA = CameraConfig(rate=120.0, latency=0.01, position_std=5e-7**0.5, yaw_std=0.02, dropout=0.02)
 """A camera as above real tables: 120 Hz, position variance 5e-7 m²."""
@@ -74,6 +74,8 @@ class AirHockeyWorld:
         controller: the arm's joint controller.
         camera: the camera.
         limits: counts what breaks the arm's limits.
+        height_deviation: largest distance of the universal joint from the height of play since the last
+            reset [m].
         goal: where the puck went out of play, or None; stays until the next reset.
     """
 
@@ -112,6 +114,7 @@ class AirHockeyWorld:
         self.camera = Camera(camera, np.random.default_rng(seed))
         self.limits = LimitMonitor(self.robot.limits)
         self.goal: Goal | None = None
+        self.height_deviation = 0.0
         self._steps = 0
         self._mallet = Mallet(self.model, self.data, mallet)
         self._log = ContactLog(self.model, self.data)
@@ -127,6 +130,7 @@ class AirHockeyWorld:
         self._puck_q = d.qpos[puck.qposadr[0] :][:3]
         self._puck_qd = d.qvel[puck.dofadr[0] :][:3]
         self._puck_origin = np.array([*table.TABLE_ORIGIN[:2], 0.0])
+        self._joint_position = d.site_xpos[self.model.site(UNIVERSAL_JOINT).id]
 
     @property
     def time(self) -> float:
@@ -148,6 +152,8 @@ class AirHockeyWorld:
         self._ctrl[:] = self.controller.torque(self._q, self._qd, q_des, qd_des, qdd_des)
         self._mallet.control()
         self.limits.observe(q_des, qd_des, qdd_des, self._q, self._qd, self.controller.demand)
+        deviation = abs(float(self._joint_position[2]) - table.UNIVERSAL_JOINT_HEIGHT)
+        self.height_deviation = max(self.height_deviation, deviation)
         pose = self.puck_pose()
         self._log.observe(now, pose, self._puck_qd, self._mallet.state)
         if now >= self.camera.next_capture:
@@ -240,14 +246,14 @@ class AirHockeyWorld:
         twist = _vector(puck_velocity, "puck_velocity", 3)
         q = _vector(self.scene.joints if joints is None else joints, "joints", self.robot.dof)
         self._check_joints(q)
-        self._check_on_table(pose)
+        _check_on_table(pose)
+        self._check_mallet(q, pose)
         data = self.data
         data.qvel[:] = data.qacc_warmstart[:] = 0.0
         self._q[:], self._puck_q[:], self._puck_qd[:] = q, pose - self._puck_origin, twist
         mujoco.mj_kinematics(self.model, data)
         self._mallet.hang()
-        self._check_apart(pose)
-        self.goal = None
+        self.goal, self.height_deviation = None, 0.0
         self._log.clear()
         self.camera.clear()
         self.controller.reset()
@@ -259,21 +265,27 @@ class AirHockeyWorld:
         if np.any(q < lower) or np.any(q > upper):
             raise InvalidInputError(f"joints {np.round(q, 3).tolist()} are beyond their position limits")
 
-    def _check_on_table(self, pose: NDArray) -> None:
-        if not table.on_table(pose[:2], table.PUCK_RADIUS - 1e-9):
-            low, high = table.to_base([[-table.HALF_LENGTH, -table.HALF_WIDTH], [table.HALF_LENGTH, table.HALF_WIDTH]])
-            raise InvalidInputError(
-                f"puck = ({pose[0]:.4g}, {pose[1]:.4g}) is not on the table; its rim must be within x from "
-                f"{low[0]:.3f} to {high[0]:.3f} m and y from {low[1]:.3f} to {high[1]:.3f} m of the base frame"
-            )
-
-    def _check_apart(self, pose: NDArray) -> None:
-        distance = float(np.linalg.norm(self.mallet_state().position[:2] - pose[:2]))
-        if distance < table.PUCK_RADIUS + table.MALLET_RADIUS:
+    def _check_mallet(self, q: NDArray, pose: NDArray) -> None:
+        """The mallet must be able to hang vertically, and not on the puck."""
+        joint, rod = self.robot.forward(q)
+        if rod[2, 2] >= 0.0:
+            raise InvalidInputError("the rod points upwards; the mallet's joint turns by 90 degrees at most")
+        distance, least = float(np.linalg.norm(joint[:2] - pose[:2])), table.PUCK_RADIUS + table.MALLET_RADIUS
+        if distance < least:
             raise InvalidInputError(
                 f"puck = ({pose[0]:.4g}, {pose[1]:.4g}) is under the mallet; their centres must be "
-                f"{table.PUCK_RADIUS + table.MALLET_RADIUS:.4f} m apart, and are {distance:.4f} m"
+                f"{least:.4f} m apart, and are {distance:.4f} m"
             )
+
+
+def _check_on_table(pose: NDArray) -> None:
+    if not table.on_table(pose[:2], table.PUCK_RADIUS - 1e-9):
+        corner = np.array([table.HALF_LENGTH, table.HALF_WIDTH])
+        low, high = table.to_base(-corner), table.to_base(corner)
+        raise InvalidInputError(
+            f"puck = ({pose[0]:.4g}, {pose[1]:.4g}) is not on the table; its rim must be within x from "
+            f"{low[0]:.3f} to {high[0]:.3f} m, y from {low[1]:.3f} to {high[1]:.3f} m of the base frame"
+        )
 
 
 def _vector(values: ArrayLike, name: str, size: int) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The KUKA LBR iiwa 14 that plays air hockey: its limits, and its model up to the mallet's universal joint."""
+"""The KUKA LBR iiwa 14 that plays air hockey: its limits, and its model up to the mallet's joint."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +19,7 @@ TORQUE_RATE_LIMITS = (np.inf,) * 7
 
 @lru_cache(maxsize=1)
 def iiwa14() -> Robot:
-    """The arm with its rod and the weight of the mallet, read once and shared (but not by threads).
+    """The arm with its rod and the weight of its mallet, read once and shared (but not by threads).
 
     Its tip is the universal joint of the mallet.
     """
