@@ -154,6 +154,12 @@ def test_the_puck_slows_down_by_its_drag(shared):
     assert table.to_table(shared.puck_pose()[:2])[0] == pytest.approx(-0.5 + expected, abs=1e-3)
 
 
+def spring_restitution(damping):
+    """Restitution of a damped spring that cannot pull."""
+    root = math.sqrt(1.0 - damping**2)
+    return math.exp(-2.0 * damping / root * math.atan2(root, damping))
+
+
 def bounces(world, count, slope):
     """Bounces off the left rim at any phase of the step, at 0.5 to 3 m/s."""
     rng = np.random.default_rng(3)
@@ -162,7 +168,7 @@ def bounces(world, count, slope):
         speed = rng.uniform(0.5, 3.0)
         world.reset(in_base(0.2, y - rng.uniform(1.0, 2.0) * 1e-3 * speed), (slope * speed, speed, 0.0))
         contact = until_a_contact_has_ended(world)
-        assert contact.surface == "left" and 1e-3 <= contact.duration <= 4.1e-3
+        assert contact.surface == "left" and contact.duration < 4.5e-3
         yield contact.velocity_before, contact.velocity_after
 
 
@@ -182,21 +188,25 @@ def test_rims_turn_sliding_into_spin(shared):
         # Off the left rim the yaw rate is positive for a puck that moves along +x. The impulse that takes
         # the tangential speed is what spins the puck: this law holds for every bounce.
         spin = after[2] * table.PUCK_RADIUS
-        lost, dragged = before[0] - after[0], 0.5 * before[0] * 3e-3
+        lost = before[0] - after[0]
         inertia = table.PUCK_INERTIA / (table.PUCK_MASS * table.PUCK_RADIUS**2)
-        assert spin * inertia == pytest.approx(lost, abs=2.0 * dragged)
+        # The dent of up to 1.5 mm shortens the lever, and the drag takes a little, too.
+        assert spin * inertia == pytest.approx(lost, rel=0.03)
     gain = np.median([after[2] * table.PUCK_RADIUS / after[0] for _, after in rows])
     assert gain == pytest.approx(0.37, abs=0.02)
 
 
-@pytest.mark.parametrize("damping", [0.005, 0.0265, 0.2, 0.35])
+@pytest.mark.parametrize("damping", [0.02, 0.0265, 0.06, 0.15])
 def test_the_rims_damping_ratio_sets_their_restitution(damping):
     world = AirHockeyWorld(AirHockeyScene(rim_damping=damping, drag=0.35))
     restitution = [-after[1] / before[1] for before, after in bounces(world, 20, 0.0)]
-    root = math.sqrt(1.0 - damping**2)
-    # A damped spring that cannot pull.
-    expected = math.exp(-2.0 * damping / root * math.atan2(root, damping))
-    assert np.median(restitution) == pytest.approx(expected, abs=0.06)
+    assert np.median(restitution) == pytest.approx(spring_restitution(damping), abs=0.06)
+
+
+@pytest.mark.parametrize("damping", [0.02, 0.075, 0.6])
+def test_the_mallets_damping_ratio_sets_its_restitution(damping):
+    world = AirHockeyWorld(AirHockeyScene(mallet_damping=damping))
+    assert rebound(world, 1.0)[1] == pytest.approx(spring_restitution(damping), abs=0.03)
 
 
 def test_posts_are_rounded(shared):
@@ -255,16 +265,25 @@ def at_puck_height(mallet):
     return (mallet.joint_velocity + swing * drop)[0]
 
 
+def restitution(world, contact):
+    """Relative speed along x after a contact that has just ended, over that before."""
+    approach = at_puck_height(contact.mallet) - contact.velocity_before[0]
+    return (contact.velocity_after[0] - at_puck_height(world.mallet_state())) / approach
+
+
+def rebound(world, speed):
+    """The contact of a puck with a resting mallet, and its restitution."""
+    world.reset((0.65 + TOUCHING + 0.01, 0.0, 0.0), (-speed, 0.0, 0.0))
+    contact = until_a_contact_has_ended(world)
+    return contact, restitution(world, contact)
+
+
 @pytest.mark.parametrize("speed", [0.3, 0.7, 1.2, 2.0])
 def test_the_puck_comes_back_from_a_resting_mallet(shared, speed):
-    shared.reset((0.65 + TOUCHING + 0.01, 0.0, 0.0), (-speed, 0.0, 0.0))
-    contact = until_a_contact_has_ended(shared)
+    contact, share = rebound(shared, speed)
     assert contact.surface == "mallet"
     assert contact.duration == pytest.approx(0.0185, abs=1.6e-3)
-    approach = at_puck_height(contact.mallet) - contact.velocity_before[0]
-    leave = contact.velocity_after[0] - at_puck_height(shared.mallet_state())
-    # A damped spring that cannot pull, ζ = 0.3: exp(-2 ζ / √(1 - ζ²) atan(√(1 - ζ²) / ζ)) = 0.45.
-    assert leave / approach == pytest.approx(0.44, abs=0.03)
+    assert share == pytest.approx(spring_restitution(0.3), abs=0.035)
     assert abs(contact.velocity_after[1]) < 0.01 * speed
 
 
@@ -288,12 +307,14 @@ def straight_strike(acceleration, speed):
 
 def test_a_strike_sends_the_puck_off_at_half_as_much_again(shared):
     """The mallet still speeds up while it touches, which adds to what the contact gives by itself."""
-    shared.reset((0.65 + TOUCHING + 0.03, 0.0, 0.0))
-    shared.follower.accept(straight_strike(5.0, 0.8), shared.time)
+    shared.reset((0.65 + TOUCHING + 0.06, 0.0, 0.0))
+    shared.follower.accept(straight_strike(3.0, 0.75), shared.time)
     contact = until_a_contact_has_ended(shared)
+    assert contact.mallet.velocity[0] == pytest.approx(0.6, abs=0.05)
+    assert contact.duration == pytest.approx(0.0185, abs=1.6e-3)
+    assert 0.38 < restitution(shared, contact) < 0.45
     gain = contact.velocity_after[0] / contact.mallet.velocity[0] - 1.0
-    assert contact.mallet.velocity[0] == pytest.approx(0.55, abs=0.05)
-    assert 0.45 < gain < 0.55
+    assert 0.45 < gain < 0.53
     assert shared.height_deviation < 5e-3
 
 
@@ -316,7 +337,6 @@ def test_the_mallet_follows_the_vertical_78_ms_late(shared, joint, axis):
     lean = shared.mallet_state().tilt[axis]
     weight = table.MALLET_MASS * 9.81 * table.MALLET_COM_OFFSET
     assert abs(lean / turned[axis]) == pytest.approx(0.31 / (4.0 + weight), rel=0.015)
-    assert 0.31 / 4.0 == pytest.approx(0.078, abs=1e-3)
 
 
 def test_a_push_on_the_mallet_decays_without_swinging(shared):
@@ -374,7 +394,7 @@ def test_reset_puts_everything_back_while_time_goes_on(shared):
     ("config", "options", "message"),
     [
         (AirHockeyScene, {"drag": -0.1}, r"drag.*0.0 to 5.0"),
-        (AirHockeyScene, {"rim_damping": 0.0}, r"rim_damping.*0.005 to 0.35"),
+        (AirHockeyScene, {"rim_damping": 0.0}, r"rim_damping.*0.02 to 0.15"),
         (AirHockeyScene, {"mallet_damping": 1.5}, "mallet_damping"),
         (AirHockeyScene, {"joints": (0.0,) * 6}, "joints.*7 numbers"),
         (AirHockeyScene, {"puck": (1.0, math.nan, 0.0)}, "puck"),
