@@ -222,6 +222,17 @@ def test_posts_are_rounded(shared):
     assert sideways[corner - 0.015] < -0.3
 
 
+def test_posts_throw_no_puck_off_at_many_times_its_speed(shared):
+    """Where it touches a post and a face at once: there the contact is stiffer than the step likes."""
+    for y in np.linspace(0.08, 0.18, 26):
+        for angle in (-0.9, -0.3, 0.3, 0.9):
+            speed = 1.8
+            shared.reset(in_base(0.9, y - 0.05 * math.tan(angle)), (speed, speed * math.tan(angle), 0.0))
+            before = math.hypot(*shared.puck_twist()[:2])
+            shared.advance(0.08)
+            assert math.hypot(*shared.puck_twist()[:2]) < 1.5 * before, (y, angle)
+
+
 @pytest.mark.parametrize(
     ("start", "velocity", "goal"),
     [

@@ -197,9 +197,12 @@ def _add_end_rim(table, scene: AirHockeyScene, name: str, end: float, side: floa
 
 
 def _add_rim(table, scene: AirHockeyScene, name: str, kind, pos, size) -> None:
+    # A puck at a post touches two surfaces at once. If it stuck to both, where one's tangent is almost the
+    # other's normal, the solver would throw it off at many times its speed: only faces have friction.
+    corner = name.endswith(("_post", "_mouth"))
     table.add_geom(
         name=name, type=kind, pos=pos, size=size, rgba=_RIM_COLOUR, group=2, contype=_FIXED,
-        conaffinity=_PUCK, condim=6, priority=1, friction=_RIM_FRICTION,
+        conaffinity=_PUCK, condim=1 if corner else 6, priority=1, friction=_RIM_FRICTION,
         solref=_spring(_RIM_PERIOD, scene.rim_damping), solimp=_RIM_IMPEDANCE,
     )  # fmt: skip
 
