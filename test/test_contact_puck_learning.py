@@ -5,7 +5,17 @@ import pytest
 
 from vpsto_ros.contact.linear_gaussian import LinearGaussian
 from vpsto_ros.contact.puck import HockeyTable, PuckModel
-from vpsto_ros.contact.puck_learning import FLOATING, MALLET, UNCLEAR, WALL, PuckRecording, label, learn
+from vpsto_ros.contact.puck_learning import (
+    FLOATING,
+    MALLET,
+    UNCLEAR,
+    WALL,
+    PuckRecording,
+    collect,
+    label,
+    learn,
+    velocities_at_touch,
+)
 from vpsto_ros.exceptions import InvalidInputError
 
 TABLE, PERIOD = HockeyTable(), 0.02
@@ -54,7 +64,7 @@ def struck(seed, count=50):
 
 
 def test_walls_and_hits_are_recognised():
-    recordings = alone(0)
+    recordings = alone(0, 100)
     for recording in recordings:
         modes, puck = label(recording, TABLE), recording.puck
         inside = (np.abs(puck[:, 0]) < TABLE.reach[0]) | (np.abs(puck[:, 1]) > 0.125)
@@ -68,8 +78,50 @@ def test_walls_and_hits_are_recognised():
     assert (hits == MALLET).mean() > 0.9 and not (hits == FLOATING).any()
 
 
+@pytest.mark.parametrize(
+    ("start", "why"),
+    [
+        ((-0.938, -0.478, -0.57, -1.02), "both walls of a corner"),
+        ((0.93, 0.3, 1.5, 0.0), "a plain bounce"),
+        ((0.93, 0.486, 1.5, 0.0), "beside another wall"),
+        ((0.93, 0.14, 1.5, -0.9), "at a post"),
+        ((0.93, 0.0, 1.5, 0.0), "into the goal"),
+        ((0.9415, 0.3, 1.5, 0.0), "begins at the wall"),
+    ],
+)
+def test_only_plain_bounces_teach_the_wall(start, why):
+    path = TRUTH.simulate([start], 1, np.random.default_rng(0))[0]
+    wanted = WALL if why == "a plain bounce" else UNCLEAR
+    assert label(PuckRecording(PERIOD, path, np.full_like(path, np.nan)), TABLE)[0] == wanted
+
+
+@pytest.mark.parametrize("contact_time", [0.0, 0.018])
+def test_hits_that_take_their_time_are_traced_back_to_their_touch(contact_time):
+    """A puck that a steady mallet speeds up evenly for 18 ms, seen at any phase of the steps."""
+    keep, gain, recordings = 1.0, 1.5, alone(4, 40)
+    for phase, speed in zip(np.linspace(0.1, 0.9, 30), np.linspace(0.5, 1.5, 30), strict=True):
+        time = PERIOD * (np.arange(6) - 1.0 - phase)  # since the touch
+        duration = max(contact_time, 1e-9)
+        driven = np.clip(time, 0.0, duration)
+        v = gain * speed * driven / duration
+        x = 0.5 * gain * speed * driven**2 / duration + gain * speed * np.maximum(time - duration, 0.0)
+        zero = np.zeros(6)
+        mallet = np.column_stack([speed * time - TABLE.contact_distance, zero, 0 * time + speed, zero])
+        puck = np.column_stack([x, zero, keep * v, zero])
+        recordings.append(PuckRecording(PERIOD, puck, mallet))
+    steps = collect(recordings, TABLE, contact_time)
+    hits = steps.outputs[MALLET]
+    assert 20 <= len(hits) <= 30
+    np.testing.assert_allclose(hits[:, 0], gain * steps.inputs[MALLET][:, 2], rtol=1e-6)
+    still = LinearGaussian(np.eye(2), np.zeros(2), 1e-6 * np.eye(2))
+    np.testing.assert_allclose(velocities_at_touch(steps, still), hits)
+    advance = hits[:, 0] * (steps.elapsed - 0.5 * contact_time)
+    np.testing.assert_allclose(steps.advance[:, 0], advance, atol=1e-5)
+
+
 def test_what_made_the_recordings_is_learned():
-    model = learn([*alone(0, 200), *struck(1, 400)], TABLE)
+    model = learn([*alone(0, 800), *struck(1, 400)], TABLE)
+    assert model.hit_delay < 1e-4, "these hits take no time"
     for name, atol in (("floating", 0.002), ("wall", 0.02), ("mallet", 0.03)):
         ours, true = getattr(model, name), getattr(TRUTH, name)
         np.testing.assert_allclose(ours.matrix, true.matrix, atol=atol, err_msg=name)

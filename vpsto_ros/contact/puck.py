@@ -19,6 +19,8 @@ from vpsto_ros.contact.linear_gaussian import LinearGaussian
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 FORMAT = "vpsto_ros puck model 1"
+SHIPPED = pathlib.Path(__file__).parent / "models" / "puck.json"
+"""The model of the simulated world, which comes with the package; its origin is in the file."""
 MODES = ("floating", "wall", "mallet")
 _INPUTS = {"floating": 2, "wall": 2, "mallet": 4}
 
@@ -90,9 +92,12 @@ class PuckModel:
         floating: velocity after a step from the velocity before it.
         wall: velocity after a step with a bounce from the velocity before it, in the frame of contact.
         mallet: velocity after a hit from the puck's and the mallet's before it, (puck, mallet), likewise.
+        hit_delay: by how much later than at the touch the velocity seems to have changed: a hit takes its
+            time [s].
 
     Raises:
-        InvalidInputError: a mode has other inputs or outputs than its own, or the period is not positive.
+        InvalidInputError: a mode has other inputs or outputs than its own, the period is not positive, or the
+            delay is negative.
     """
 
     table: HockeyTable
@@ -100,10 +105,13 @@ class PuckModel:
     floating: LinearGaussian
     wall: LinearGaussian
     mallet: LinearGaussian
+    hit_delay: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.period) and self.period > 0.0):
             raise InvalidInputError(f"the period of a puck model must be positive, got {self.period}")
+        if not (np.isfinite(self.hit_delay) and self.hit_delay >= 0.0):
+            raise InvalidInputError(f"the delay of hits must not be negative, got {self.hit_delay}")
         for name in MODES:
             shape, expected = getattr(self, name).matrix.shape, (2, _INPUTS[name])
             if shape != expected:
@@ -114,12 +122,16 @@ class PuckModel:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Puck states after being hit, (5.3).
 
+        Deviation: a real hit takes about 20 ms, so that the puck moves on as if it had changed its velocity
+        `hit_delay` later; its position is shifted back by what that delay takes away.
+
         Args:
             puck: states (x, y, vx, vy) before, shape (B, 4) [m, m/s].
             mallet: states of the mallet likewise; the normal is the direction from it to the puck.
 
         Returns:
-            mean (B, 4) and covariance (B, 4, 4): positions are those before, and certain.
+            mean (B, 4) and covariance (B, 4, 4) as of the touch: without a delay positions are those before,
+            and certain.
 
         Raises:
             InvalidInputError: the shapes do not fit, or centres coincide.
@@ -133,7 +145,10 @@ class PuckModel:
         )
         mean, covariance = puck.copy(), np.zeros((len(puck), 4, 4))
         mean[:, 2:] = np.einsum("bij,bj->bi", frames, self.mallet.mean(before))
-        covariance[:, 2:, 2:] = frames @ self.mallet.covariance @ frames.transpose(0, 2, 1)
+        mean[:, :2] -= self.hit_delay * (mean[:, 2:] - puck[:, 2:])
+        spread = frames @ self.mallet.covariance @ frames.transpose(0, 2, 1)
+        covariance[:, 2:, 2:], covariance[:, :2, :2] = spread, self.hit_delay**2 * spread
+        covariance[:, :2, 2:] = covariance[:, 2:, :2] = -self.hit_delay * spread
         return mean, covariance
 
     def step(
@@ -205,7 +220,7 @@ class PuckModel:
         """
         content = {
             "format": FORMAT, "origin": origin, "period": self.period,
-            "table": dataclasses.asdict(self.table),
+            "hit_delay": self.hit_delay, "table": dataclasses.asdict(self.table),
             **{name: getattr(self, name).as_dict() for name in MODES},
         }  # fmt: skip
         pathlib.Path(path).write_text(json.dumps(content, indent=1) + "\n")
@@ -229,7 +244,8 @@ class PuckModel:
             raise ConfigurationError(f"{path} is not of the format '{FORMAT}'")
         try:
             modes = {name: LinearGaussian(**content[name]) for name in MODES}
-            return cls(HockeyTable(**content["table"]), float(content["period"]), **modes)
+            table, delay = HockeyTable(**content["table"]), float(content.get("hit_delay", 0.0))
+            return cls(table, float(content["period"]), **modes, hit_delay=delay)
         except (KeyError, TypeError, ValueError, InvalidInputError, ConfigurationError) as error:
             raise ConfigurationError(f"{path} is not a puck model: {error}") from None
 
