@@ -15,7 +15,6 @@ on were looked at.
 """
 
 import argparse
-import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -51,13 +50,9 @@ def trial(task: tuple[int, str]) -> list[Prediction]:
     """Predictions of the two episodes of a seed by the model in a file."""
     seed, path = task
     model = PuckModel.load(path)
-    episodes = [_recorder().episode(kind, (_STREAM, seed)) for kind in recordings.KINDS]
+    recorder = Recorder()  # a fresh world: what was simulated before must not change a bit
+    episodes = [recorder.episode(kind, (_STREAM, seed)) for kind in recordings.KINDS]
     return [prediction for episode in episodes for prediction in predictions(episode, model)]
-
-
-@functools.cache
-def _recorder() -> Recorder:
-    return Recorder()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
