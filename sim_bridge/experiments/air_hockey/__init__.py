@@ -1,0 +1,1 @@
+"""Air hockey: how well pucks are predicted."""
