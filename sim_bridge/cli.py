@@ -55,6 +55,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.estimation.particle_filter",
         "track a pushed can that is seen, unseen or felt only",
     ),
+    "puck_filter": Choice(
+        "sim_bridge.experiments.hockey.puck_filter",
+        "velocity of an air-hockey puck through bounces and hits",
+    ),
     "clutter_2d": Choice(
         "sim_bridge.experiments.clutter.clutter_2d",
         "a point among three obstacles: ways found, time, success",

@@ -60,7 +60,7 @@ class PuckFilterConfig:
         5.0, "how far ahead of the last position states are predicted", unit="s", minimum=0.0, maximum=60.0
     )
     wall_contact: tuple[float, float] = option(
-        (0.0043, 0.0005), "how long contacts with walls last, mean and standard deviation; 0 is at once",
+        (0.002, 0.0001), "how long contacts with walls last, mean and standard deviation; 0 is at once",
         unit="s", minimum=0.0, maximum=0.1,
     )  # fmt: skip
     mallet_contact: tuple[float, float] = option(

@@ -41,7 +41,8 @@ class Touch:
         surface: "wall" or "mallet".
         begun, ends: when it began and is expected to end [s].
         normal: from what is touched to the puck, shape (2,).
-        velocity: of what is touched, along the normal, shape (2,) [m/s].
+        velocity: of what is touched, along the normal, and half of what the contact takes from the puck's
+            tangential velocity, which changes on the way: shape (2,) [m/s].
         depth: how far the puck dents it at most [m].
         scatter: standard deviation of the position along the normal at the end [m].
     """
@@ -80,7 +81,7 @@ class PuckBelief:
 
 
 class MalletTrack:
-    """Measured states of the mallet, interpolated by cubics."""
+    """Measured states of the mallet, interpolated."""
 
     def __init__(self, kept: float, extrapolation: float, longest_gap: float = 0.1) -> None:
         """Begin without any.
@@ -160,7 +161,8 @@ class PuckMotion:
         duration = min(stamp - belief.stamp, self._model.period)
         if mallet is not None and self._near(belief.mean, mallet, duration):
             duration = min(duration, _NEAR_STEP)
-        wall, axis, side = puck_rollout.next_wall(self._rows, *belief.mean, duration)
+        x, y, vx, vy = belief.mean
+        wall, axis, side = puck_rollout.next_wall(self._rows, x, y, vx, vy, duration)
         hit = math.inf if mallet is None else hit_time(
             belief.mean - mallet, self._model.table.contact_distance
         )  # fmt: skip
@@ -185,8 +187,7 @@ class PuckMotion:
         met = self._moved(belief, time * (1.0 + 1e-12) + 1e-12)
         normal = np.zeros(2)
         normal[axis] = -side
-        closing = -float(normal @ belief.mean[2:])
-        return self._begin("wall", met, normal, np.zeros(2), closing)
+        return self._begin("wall", met, belief.mean[2:], normal, np.zeros(2))
 
     def _hit(self, belief: PuckBelief) -> PuckBelief:
         """Be hit by the mallet now, (5.3), as the mean is; the Jacobian says what other states do."""
@@ -198,8 +199,13 @@ class PuckMotion:
         a = self._hit_jacobian(belief.mean, mallet, normal)
         spread = a @ belief.covariance @ a.T + noise[0]
         met = dataclasses.replace(belief, mean=after[0], covariance=0.5 * (spread + spread.T))
-        closing = float(normal @ (mallet - belief.mean)[2:])
-        return self._begin("mallet", met, normal, mallet[2:], closing)
+        return self._begin("mallet", met, belief.mean[2:], normal, self._mean_velocity(belief.stamp, mallet))
+
+    def _mean_velocity(self, stamp: float, mallet: NDArray) -> NDArray[np.float64]:
+        """Of the mallet in a contact that begins now, shape (2,), as far as its motion is known."""
+        duration = self._timing["mallet"].duration
+        later = self._track.at(stamp + duration) if duration > 0.0 else None
+        return mallet[2:] if later is None else (later[:2] - mallet[:2]) / duration
 
     def _hit_jacobian(self, puck: NDArray, mallet: NDArray, normal: NDArray) -> NDArray[np.float64]:
         """By central differences, shape (4, 4): other states meet the mallet at another time and angle."""
@@ -214,21 +220,30 @@ class PuckMotion:
         return (after[:4] - after[4:]).T / (2.0 * step)
 
     def _begin(
-        self, surface: str, met: PuckBelief, normal: NDArray, velocity: NDArray, closing: float
+        self, surface: str, met: PuckBelief, before: NDArray, normal: NDArray, velocity: NDArray
     ) -> PuckBelief:
-        """A contact that has just been met, with the velocity after it; it leaves what it touches."""
-        along = (normal @ velocity) * normal
-        leaving = float(normal @ (met.mean[2:] - along))
-        mean = met.mean.copy()
+        """A contact that has just been met, with the velocity after it; it leaves what it touches.
+
+        Args:
+            surface: what is met.
+            met: the belief with the velocity after the contact.
+            before: velocity of the puck before it (2,).
+            normal: of the contact (2,).
+            velocity: of what is met (2,).
+        """
+        leaving = float(normal @ (met.mean[2:] - velocity))
+        closing, apart = max(float(normal @ (velocity - before)), 0.0), max(leaving, 0.0)
+        mean, timing = met.mean.copy(), self._timing[surface]
         if leaving < 0.0:
             mean[2:] -= leaving * normal
-        timing, apart = self._timing[surface], max(leaving, 0.0)
         touch = None
         if timing.duration > 0.0:
+            change = 0.5 * (before - mean[2:])
+            carried = (normal @ velocity) * normal + change - (normal @ change) * normal
             # A spring that gives back a share e of the speed is dented by about sqrt(e) v T / pi.
-            depth = math.sqrt(max(closing, 0.0) * apart) * timing.duration / math.pi
+            depth = math.sqrt(closing * apart) * timing.duration / math.pi
             ends = met.stamp + timing.duration
-            touch = Touch(surface, met.stamp, ends, normal, along, depth, timing.std * apart)
+            touch = Touch(surface, met.stamp, ends, normal, carried, depth, timing.std * apart)
         return PuckBelief(met.stamp, mean, met.covariance, touch, met.contacts + 1)
 
     def _touching(self, belief: PuckBelief, touch: Touch, stamp: float) -> PuckBelief:
@@ -269,9 +284,12 @@ def _evenly(state: NDArray, time: float) -> NDArray[np.float64]:
 
 
 def _cubic(first: NDArray, second: NDArray, step: float, s: float) -> NDArray[np.float64]:
-    """Hermite's cubic and its rate at a share s of a step [s]."""
+    """State at a share s of a step [s]: Hermite's cubic.
+
+    The velocity is the one measured, interpolated: the rate of the cubic would be noisier than either end.
+    """
     change = second[:2] - first[:2]
     start, end = step * first[2:], step * second[2:]
     two, three = 3.0 * change - 2.0 * start - end, start + end - 2.0 * change
     position = first[:2] + s * (start + s * (two + s * three))
-    return np.concatenate([position, (start + s * (2.0 * two + 3.0 * s * three)) / step])
+    return np.concatenate([position, (1.0 - s) * first[2:] + s * second[2:]])

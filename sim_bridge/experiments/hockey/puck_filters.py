@@ -9,9 +9,9 @@ from sim_bridge.experiments.hockey.puck_episodes import Episode, Log, record
 from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.estimation.puck_filter import PuckFilter, PuckFilterConfig
 
-PIECEWISE, CONSTANT, CONSTANT_OVERALL = "piecewise", "constant_velocity", "constant_velocity_overall"
+PIECEWISE = "piecewise"
 BOUNCE, HIT, OTHERWISE, IGNORED = 0, 1, 2, -1
-"""When: so soon after the last bounce or hit; otherwise; during contacts and at the very beginning."""
+"""When: soon after the last bounce or hit; otherwise; during contacts and at the very beginning."""
 AFTER = 0.1
 """So long after a contact its effect counts [s]."""
 

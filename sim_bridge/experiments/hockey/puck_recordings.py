@@ -1,6 +1,7 @@
 """What the model of the puck, and how long contacts last, are learned from: steps cut from episodes.
 
-A step with a contact begins just before it and ends after it, so that none sees half of a contact.
+A step with a contact begins just before it and ends after it, so that none sees half of a contact. The mallet
+is taken as it was measured: its noise is part of what the filter does not know about a hit.
 """
 
 import numpy as np
@@ -10,7 +11,7 @@ from sim_bridge.experiments.hockey.puck_episodes import Episode, Log, record
 from vpsto_ros.contact.puck import HockeyTable, PuckModel
 from vpsto_ros.contact.puck_learning import PuckRecording, learn
 from vpsto_ros.estimation.puck_filter import PuckFilterConfig
-from vpsto_ros.estimation.puck_motion import hit_time
+from vpsto_ros.estimation.puck_motion import MalletTrack, hit_time
 
 PERIOD = 0.025
 """Of a step [s]; contacts with the mallet last about 18.5 ms."""
@@ -37,17 +38,15 @@ def cut(episode: Episode) -> list[PuckRecording]:
 
 def fit(recordings: list[PuckRecording]) -> tuple[PuckModel, PuckFilterConfig]:
     """The model, and the options of the filter with how long contacts were."""
-    timing = {"wall": _contact_times(recordings, False), "mallet": _contact_times(recordings, True)}
-    config = PuckFilterConfig(
-        **{f"{name}_contact": (max(float(np.median(t)), 0.0), _spread(t)) for name, t in timing.items()}
-    )
+    wall, mallet = _contact_times(recordings, False), _contact_times(recordings, True)
+    config = PuckFilterConfig(wall_contact=_timing(wall), mallet_contact=_timing(mallet))
     return learn(recordings, _TABLE), config
 
 
-def _spread(times: NDArray) -> float:
-    """Standard deviation that the middle two thirds have: grazing contacts are not to count."""
-    low, high = np.quantile(times, [0.16, 0.84])
-    return float(0.5 * (high - low))
+def _timing(times: NDArray) -> tuple[float, float]:
+    """Median, and the standard deviation of the middle two thirds: grazing contacts are not to count."""
+    low, middle, high = np.quantile(times, [0.16, 0.5, 0.84])
+    return max(float(middle), 0.0), float(0.5 * (high - low))
 
 
 def _index(log: Log, time: float) -> int:
@@ -66,7 +65,12 @@ def _untouched(log: Log, contacts: NDArray, first: int) -> bool:
 
 def _step(log: Log, first: int) -> PuckRecording:
     chosen = slice(first, first + _STEPS + 1, _STEPS)
-    return PuckRecording(PERIOD, log.puck[chosen], log.mallet[chosen])
+    track = MalletTrack(kept=10.0, extrapolation=0.02)
+    for stamp, *state in log.mallet_measured:
+        track.append(stamp, np.array(state))
+    states = [track.at(time) for time in log.times[chosen]]
+    mallet = np.array([np.full(4, np.nan) if state is None else state for state in states])
+    return PuckRecording(PERIOD, log.puck[chosen], mallet)
 
 
 def _contact_times(recordings: list[PuckRecording], mallets: bool) -> NDArray[np.float64]:
