@@ -273,7 +273,7 @@ def test_a_puck_that_left_through_a_goal_is_lost_until_there_is_another():
     ("stamp", "position", "covariance"),
     [
         (math.nan, [0.0, 0.0], None), (math.inf, [0.0, 0.0], None), ("soon", [0.0, 0.0], None),
-        (None, [0.0, 0.0], None), (0.5, [math.nan, 0.0], None), (0.5, [0.0], None), (0.5, "x", None),
+        (None, [0.0, 0.0], None), (10**400, [0.0, 0.0], None), (0.5, [math.nan, 0.0], None), (0.5, [0.0], None), (0.5, "x", None),
         (0.5, None, None), (0.5, [0.0, 0.53], None), (0.5, [3.0, 0.0], None), (0.5, [1.0, 0.2], None),
         (0.5, [0.0, 0.0], np.zeros((2, 2))), (0.5, [0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]]),
         (0.5, [0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]]), (0.5, [0.0, 0.0], np.full((2, 2), np.inf)),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sim_bridge.experiments.hockey import puck_filter_figure
 from sim_bridge.experiments.hockey.puck_episodes import KINDS, Episode
 from sim_bridge.experiments.hockey.puck_filters import (
+    AT_ONCE,
     BOUNCE,
     HIT,
     OTHERWISE,
@@ -28,7 +29,7 @@ from sim_bridge.experiments.hockey.puck_recordings import cut, fit
 from sim_bridge.experiments.runs import Execution, markdown_table, print_verdict, run_trials, write_summary
 
 PHASES = {"bounce": BOUNCE, "hit": HIT, "otherwise": OTHERWISE}
-NOISES = (0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0, 10.0, 20.0)
+NOISES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0, 10.0, 20.0)
 """Among which those of the constant-velocity filters are chosen [m/s per sqrt(s)]."""
 LEAST_RATIO = 3.0
 """By how much the piecewise filter is to be better within 100 ms after a bounce."""
@@ -79,7 +80,7 @@ def opponent(phase: str) -> str:
 
 def tuned(found: list[Comparison]) -> dict[str, float]:
     """Process noise of the best constant-velocity filter in each phase, of those that were tried."""
-    names, best = [name for name in found[0].errors if name != PIECEWISE], {}
+    names, best = [name for name in found[0].errors if name not in (PIECEWISE, AT_ONCE)], {}
     for phase, code in PHASES.items():
         errors = [_mean(_sums(found, name, code)) for name in names]
         best[opponent(phase)] = float(names[int(np.argmin(errors))])
@@ -159,14 +160,15 @@ def _verdict(summary: dict[str, Any]) -> int:
     missed = missed_targets(summary)
     low, high = summary["nis_interval"]
     found = (
-        f"velocity errors after bounces {summary['velocity_error_ratio']:.1f} times smaller than with constant"
-        f" velocity, mean normalised innovation squared {summary['nis_mean']:.3f} ({low:.3f}-{high:.3f})"
+        f"velocity errors after bounces {summary['velocity_error_ratio']:.1f} times smaller than with"
+        f" constant velocity, mean normalised innovation squared {summary['nis_mean']:.3f}"
+        f" ({low:.3f}-{high:.3f})"
     )
     return print_verdict(not missed, "; ".join(missed) or found)
 
 
 def _table(summary: dict[str, Any]) -> str:
-    labels = {PIECEWISE: "piecewise-linear"} | {
+    labels = {PIECEWISE: "piecewise-linear", AT_ONCE: "the same, contacts over at once"} | {
         opponent(phase): f"constant velocity, tuned {text}"
         for phase, text in (("bounce", "after bounces"), ("hit", "after hits"), ("otherwise", "otherwise"))
     }

@@ -9,7 +9,8 @@ from sim_bridge.experiments.hockey.puck_episodes import Episode, Log, record
 from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.estimation.puck_filter import PuckFilter, PuckFilterConfig
 
-PIECEWISE = "piecewise"
+PIECEWISE, AT_ONCE = "piecewise", "piecewise_at_once"
+"""The filter as it is, and with contacts that are over at once, as the thesis has them."""
 BOUNCE, HIT, OTHERWISE, IGNORED = 0, 1, 2, -1
 """When: soon after the last bounce or hit; otherwise; during contacts and at the very beginning."""
 AFTER = 0.1
@@ -101,7 +102,9 @@ def compare(task: Task) -> Comparison:
     log = record(task.episode)
     ticks, truth = log.times[:: round(1e3 * _TICK)], log.puck[:: round(1e3 * _TICK), 2:]
     velocities, innovations, refused = piecewise_velocities(log, ticks, task)
-    tracks = {PIECEWISE: velocities} | {
+    brief = dataclasses.replace(task.config, wall_contact=(0.0, 0.0), mallet_contact=(0.0, 0.0))
+    at_once, _, _ = piecewise_velocities(log, ticks, dataclasses.replace(task, config=brief))
+    tracks = {PIECEWISE: velocities, AT_ONCE: at_once} | {
         name: constant_velocities(log, ticks, noise, task.config.position_std)
         for name, noise in task.noises.items()
     }
