@@ -273,7 +273,8 @@ def test_a_puck_that_left_through_a_goal_is_lost_until_there_is_another():
     ("stamp", "position", "covariance"),
     [
         (math.nan, [0.0, 0.0], None), (math.inf, [0.0, 0.0], None), ("soon", [0.0, 0.0], None),
-        (None, [0.0, 0.0], None), (10**400, [0.0, 0.0], None), (0.5, [math.nan, 0.0], None), (0.5, [0.0], None), (0.5, "x", None),
+        (None, [0.0, 0.0], None), (10**400, [0.0, 0.0], None), (0.5, [0.0, 0.0], 1e-14 * np.eye(2)),
+        (0.5, [math.nan, 0.0], None), (0.5, [0.0], None), (0.5, "x", None),
         (0.5, None, None), (0.5, [0.0, 0.53], None), (0.5, [3.0, 0.0], None), (0.5, [1.0, 0.2], None),
         (0.5, [0.0, 0.0], np.zeros((2, 2))), (0.5, [0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]]),
         (0.5, [0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]]), (0.5, [0.0, 0.0], np.full((2, 2), np.inf)),
@@ -292,7 +293,7 @@ def test_bad_states_of_the_mallet_are_refused_and_old_positions_are_stale():
     estimator, _ = fed(straight([-0.5, 0.0], [0.5, 0.1]), FRAME * np.arange(1, 20))
     for stamp, position, velocity in (
         (math.nan, [0.0, 0.0], [0.0, 0.0]), (0.1, [0.0], [0.0, 0.0, 0.0]), (0.1, None, [0.0, 0.0]),
-        ("x", [0.0, 0.0], [0.0, 0.0]), (0.1, [0.0, 0.0], [math.inf, 0.0]),
+        ("x", [0.0, 0.0], [0.0, 0.0]), (0.1, [0.0, 0.0], [math.inf, 0.0]), (0.1, [0.0, 0.0], [0.0, 1e6]),
     ):  # fmt: skip
         assert estimator.observe_mallet(stamp, position, velocity).kind == "invalid"
     assert estimator.observe_mallet(0.1, [0.0, 0.0], [0.0, 0.0]) == "accepted"
@@ -337,4 +338,20 @@ def test_covariances_stay_positive_definite_whatever_happens(seed):
         estimator.update(stamp, truth[:2] + STD * rng.normal(size=2))
         for ahead in (0.0, rng.uniform(0.0, 0.2)):
             state = estimator.state(stamp + ahead)
+            assert np.isfinite(state.mean).all() and positive_definite(state.covariance)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nothing_from_outside_raises_or_leaves_numbers_that_are_none(seed):
+    rng, estimator, stamp = np.random.default_rng(seed), PuckFilter(model(wall=0.1, mallet=0.1)), 0.0
+    for _ in range(150):
+        stamp += rng.choice([0.0, 0.001, 0.008, 0.1, -0.01, 1.0, 1e-12])
+        fast = rng.normal(size=2) * rng.choice([0.0, 1.0, 4.0, 1e6])
+        estimator.observe_mallet(stamp + 0.01 * rng.normal(), rng.uniform(-1.0, 1.0, 2), fast)
+        near = np.array([-0.5, 0.48]) + 1e-3 * rng.normal(size=2)
+        position = rng.uniform(-1.1, 1.1, 2) if rng.random() < 0.3 else near
+        estimator.update(stamp, position, 10.0 ** rng.uniform(-14.0, 0.0) * np.eye(2))
+        state = estimator.state(stamp + rng.choice([0.0, 0.01, 3.0]))
+        assert estimator.status(stamp).kind
+        if state is not None:
             assert np.isfinite(state.mean).all() and positive_definite(state.covariance)

@@ -19,6 +19,7 @@ from vpsto_ros.estimation.puck_motion import ContactTiming, MalletTrack, PuckBel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 _DENT_SHARE = 0.3  # of the depth that is expected of a dent: how well it is known
+_LEAST_STD = 1e-6  # no position is measured better [m]
 _GOAL_DEPTH = 0.2  # a puck that is seen in a goal is no farther behind its line [m]
 
 
@@ -174,6 +175,8 @@ class PuckFilter:
         state, defect = finite_array([stamp, *_entries(position), *_entries(velocity)], (5,))
         if defect:
             return Outcome("invalid", f"time, position (2,) and velocity (2,) of the mallet: {defect}")
+        if np.abs(state[3:]).max() > 2.0 * self.config.max_speed:
+            return Outcome("invalid", f"a mallet at {np.abs(state[3:]).max():.3g} m/s")
         ahead = state[0] - self._mallet.last
         if -self.config.max_gap < ahead <= 0.0:
             return Outcome("stale", f"stamp is {-ahead:.4g} s older than the last one")
@@ -240,6 +243,9 @@ class PuckFilter:
             self._restart([sighting])
             return Outcome("reinitialized", f"first position after {gap:.3g} s")
         predicted = self._motion.advance(belief, sighting.stamp)
+        if not np.diag(predicted.covariance)[2:].max() < (4.0 * self.config.max_speed) ** 2:
+            self._restart([sighting])
+            return Outcome("reinitialized", "contacts have left nothing known of the velocity")
         corrected, self.distance = _corrected(predicted, sighting)
         if not self.distance <= self.config.gate:
             reason = f"squared Mahalanobis distance {self.distance:.3g} > {self.config.gate:g}"
@@ -305,8 +311,8 @@ def _checked(stamp: object, position: object, covariance: object) -> tuple[_Sigh
     defect = "; ".join(f"{name}: {text}" for name, text in defects if text)
     if not defect:
         skew = abs(noise[0, 1] - noise[1, 0]) > 1e-6 * np.abs(noise).max()
-        if skew or not (noise[0, 0] > 0.0 and np.linalg.det(noise) > 0.0):
-            defect = "covariance: not symmetric positive definite"
+        if skew or np.linalg.eigvalsh(noise)[0] < (1.0 - 1e-6) * _LEAST_STD**2:
+            defect = f"covariance: not symmetric positive definite with at least {_LEAST_STD:g} m"
     return _Sighting(float(time) if time.shape == () else math.nan, where, noise), defect
 
 

@@ -17,6 +17,7 @@ from vpsto_ros.contact.puck import PuckModel
 _TINY = 1e-9  # shorter times are none [s]
 _NEAR_STEP = 0.005  # for so long the mallet is taken to move evenly when the puck is near it [s]
 _LEAST_CLOSING = 5e-3  # slower, puck and mallet do not hit each other but move together [m/s]
+_GRAZING = 0.1  # cosine of the angle between normal and approach below which a hit grazes
 _MOST_CONTACTS = 16  # in one prediction; a puck that is squeezed has no end of them
 
 
@@ -211,7 +212,10 @@ class PuckMotion:
         """By central differences, shape (4, 4): other states meet the mallet at another time and angle."""
         step = 1e-6
         offsets = step * np.vstack([np.eye(4), -np.eye(4)])
-        shift = -(offsets[:, :2] @ normal) / (normal @ (puck - mallet)[2:])
+        relative = (puck - mallet)[2:]
+        # Where they graze, the time of the hit is no linear function of the state any more.
+        closing = max(-float(normal @ relative), _LEAST_CLOSING, _GRAZING * math.hypot(*relative))
+        shift = (offsets[:, :2] @ normal) / closing
         before, other = puck + offsets, np.tile(mallet, (8, 1))
         before[:, :2] += shift[:, None] * before[:, 2:]
         other[:, :2] += shift[:, None] * mallet[2:]
