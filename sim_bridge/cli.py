@@ -56,6 +56,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.estimation.particle_filter",
         "track a pushed can that is seen, unseen or felt only",
     ),
+    "puck_filter": Choice(
+        "sim_bridge.experiments.hockey.puck_filter",
+        "velocity of an air-hockey puck through bounces and hits",
+    ),
     "clutter_2d": Choice(
         "sim_bridge.experiments.clutter.clutter_2d",
         "a point among three obstacles: ways found, time, success",
@@ -117,7 +121,7 @@ EXPERIMENTS = {
         "two balls, a disc, a circle: iterations, prior, joints",
     ),
     "puck_model": Choice(
-        "sim_bridge.experiments.air_hockey.puck_model",
+        "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
 }

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim_bridge import cli
-from sim_bridge.experiments.air_hockey import puck_model
-from sim_bridge.experiments.air_hockey.predictions import HORIZONS, Prediction, predictions
+from sim_bridge.experiments.hockey import puck_model
+from sim_bridge.experiments.hockey.predictions import HORIZONS, Prediction, predictions
 from sim_bridge.hockey import table
 from sim_bridge.hockey.recordings import (
     CONTACT_TIME,

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments.air_hockey import puck_model_figure
-from sim_bridge.experiments.air_hockey.predictions import HORIZONS, KINDS, Prediction, predictions
+from sim_bridge.experiments.hockey import puck_model_figure
+from sim_bridge.experiments.hockey.predictions import HORIZONS, KINDS, Prediction, predictions
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,

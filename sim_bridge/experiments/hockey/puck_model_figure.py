@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_bridge.experiments.air_hockey.predictions import KINDS, Prediction
+from sim_bridge.experiments.hockey.predictions import KINDS, Prediction
 from sim_bridge.hockey.recordings import TABLE
 
 COLOURS = {"floating": "tab:green", "wall": "tab:blue", "hit": "tab:orange", "hit_wall": "tab:red"}

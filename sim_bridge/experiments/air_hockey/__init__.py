@@ -1,1 +1,0 @@
-"""Air hockey: how well pucks are predicted."""
