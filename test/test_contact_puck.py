@@ -68,6 +68,17 @@ def test_a_central_hit_drives_the_puck_along_the_normal():
     np.testing.assert_array_equal(covariance[:, :2], 0.0)
 
 
+def test_a_delayed_hit_shifts_positions_unless_it_is_told_not_to():
+    puck = np.array([[0.1, 0.0, -0.2, 0.0]])
+    mallet = np.array([[0.1 - TABLE.contact_distance, 0.0, 1.0, 0.0]])
+    late = dataclasses.replace(model(), hit_delay=5e-3)
+    mean, covariance = late.hit(puck, mallet)
+    assert mean[0, 0] == pytest.approx(0.1 - 5e-3 * (mean[0, 2] + 0.2))
+    assert covariance[0, 0, 0] == pytest.approx(5e-3**2 * covariance[0, 2, 2])
+    for found, expected in zip(late.hit(puck, mallet, delayed=False), model().hit(puck, mallet), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 # Steps
 
 

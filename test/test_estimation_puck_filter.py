@@ -216,6 +216,19 @@ def test_the_covariance_of_a_hit_is_that_of_samples():
     np.testing.assert_allclose(ratio, 1.0, atol=0.06)
 
 
+@pytest.mark.parametrize("config", [AT_ONCE, PuckFilterConfig()])
+def test_a_model_whose_hits_are_delayed_is_not_delayed_twice(config):
+    late, at = dataclasses.replace(model(), hit_delay=6e-3), 19 * FRAME
+    states = []
+    for puck in (model(), late):
+        estimator, _ = fed(straight([0.0, 0.0], [0.0, 0.0]), FRAME * np.arange(1, 20), config, puck)
+        estimator.observe_mallet(at, [-TABLE.contact_distance - 0.02, 0.0], [1.0, 0.0])
+        states.append(estimator.state(at + 0.045))
+    assert states[1].contacts == 1
+    np.testing.assert_array_equal(states[1].mean, states[0].mean)
+    np.testing.assert_array_equal(states[1].covariance, states[0].covariance)
+
+
 # What goes wrong
 
 

@@ -118,7 +118,7 @@ class PuckModel:
                 raise InvalidInputError(f"the {name} mode needs a matrix {expected}, got {shape}")
 
     def hit(
-        self, puck: ArrayLike, mallet: ArrayLike
+        self, puck: ArrayLike, mallet: ArrayLike, *, delayed: bool = True
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Puck states after being hit, (5.3).
 
@@ -128,6 +128,8 @@ class PuckModel:
         Args:
             puck: states (x, y, vx, vy) before, shape (B, 4) [m, m/s].
             mallet: states of the mallet likewise; the normal is the direction from it to the puck.
+            delayed: whether positions are shifted by `hit_delay`; not for callers who say themselves where
+                the puck is while a hit lasts.
 
         Returns:
             mean (B, 4) and covariance (B, 4, 4) as of the touch: without a delay positions are those before,
@@ -145,10 +147,11 @@ class PuckModel:
         )
         mean, covariance = puck.copy(), np.zeros((len(puck), 4, 4))
         mean[:, 2:] = np.einsum("bij,bj->bi", frames, self.mallet.mean(before))
-        mean[:, :2] -= self.hit_delay * (mean[:, 2:] - puck[:, 2:])
+        delay = self.hit_delay if delayed else 0.0
+        mean[:, :2] -= delay * (mean[:, 2:] - puck[:, 2:])
         spread = frames @ self.mallet.covariance @ frames.transpose(0, 2, 1)
-        covariance[:, 2:, 2:], covariance[:, :2, :2] = spread, self.hit_delay**2 * spread
-        covariance[:, :2, 2:] = covariance[:, 2:, :2] = -self.hit_delay * spread
+        covariance[:, 2:, 2:], covariance[:, :2, :2] = spread, delay**2 * spread
+        covariance[:, :2, 2:] = covariance[:, 2:, :2] = -delay * spread
         return mean, covariance
 
     def step(

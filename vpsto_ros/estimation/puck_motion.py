@@ -1,7 +1,8 @@
 """How the belief about a puck moves on: floating, off walls and off the mallet, each met at its time.
 
 The learned modes are those of :class:`vpsto_ros.contact.puck.PuckModel`; contacts are not over at once, and
-during one the puck stays with what it touches. Frame: the table's, origin in its centre.
+during one the puck stays with what it touches. The model's delay of hits, which stands for the same, is
+therefore left out. Frame: the table's, origin in its centre.
 """
 
 import bisect
@@ -196,7 +197,7 @@ class PuckMotion:
         if mallet is None:  # it was seen to come, but is not known at that time
             return belief
         normal = _unit(belief.mean[:2] - mallet[:2])
-        after, noise = self._model.hit(belief.mean[None], mallet[None])
+        after, noise = self._model.hit(belief.mean[None], mallet[None], delayed=False)
         a = self._hit_jacobian(belief.mean, mallet, normal)
         spread = a @ belief.covariance @ a.T + noise[0]
         met = dataclasses.replace(belief, mean=after[0], covariance=0.5 * (spread + spread.T))
@@ -219,7 +220,7 @@ class PuckMotion:
         before, other = puck + offsets, np.tile(mallet, (8, 1))
         before[:, :2] += shift[:, None] * before[:, 2:]
         other[:, :2] += shift[:, None] * mallet[2:]
-        after, _ = self._model.hit(before, other)
+        after, _ = self._model.hit(before, other, delayed=False)
         after[:, :2] -= shift[:, None] * after[:, 2:]
         return (after[:4] - after[4:]).T / (2.0 * step)
 
