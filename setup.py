@@ -16,7 +16,11 @@ setup(
     maintainer_email="vpsto-ros@example.com",
     license="Apache-2.0",
     packages=find_packages(include=["vpsto_ros", "vpsto_ros.*", "sim_bridge", "sim_bridge.*"]),
-    package_data={"vpsto_ros": ["py.typed"], "vpsto_ros.robot": ["models/*.xml"]},
+    package_data={
+        "vpsto_ros": ["py.typed"],
+        "vpsto_ros.robot": ["models/*.xml"],
+        "vpsto_ros.contact": ["models/*.json"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/" + PACKAGE]),
         ("share/" + PACKAGE, ["package.xml"]),

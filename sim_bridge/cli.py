@@ -1,4 +1,4 @@
-"""The ``vpsto`` command: demos over ROS 2 topics, experiments in lock-step, benchmarks."""
+"""The ``vpsto`` command: demos over ROS 2 topics, experiments in lock-step, models to learn, benchmarks."""
 
 import argparse
 import importlib
@@ -20,6 +20,7 @@ examples:
   vpsto demo bimanual_push                    two arms push a can by a belief; see output/bimanual_push
   vpsto experiment push_box --runs 20         20 random boxes, in lock-step and without ROS
   vpsto experiment push_box --resume          go on with an experiment that was stopped
+  vpsto learn puck_model                      how a puck bounces and is hit; see output/puck_model.json
   vpsto bench --json bench.json               how long search, replanning and simulation take here
   vpsto bench --compare bench.json            and what has changed since
 
@@ -54,6 +55,10 @@ EXPERIMENTS = {
     "particle_filter": Choice(
         "sim_bridge.experiments.estimation.particle_filter",
         "track a pushed can that is seen, unseen or felt only",
+    ),
+    "puck_filter": Choice(
+        "sim_bridge.experiments.hockey.puck_filter",
+        "velocity of an air-hockey puck through bounces and hits",
     ),
     "clutter_2d": Choice(
         "sim_bridge.experiments.clutter.clutter_2d",
@@ -115,6 +120,13 @@ EXPERIMENTS = {
         "sim_bridge.experiments.belief.belief_ablation",
         "two balls, a disc, a circle: iterations, prior, joints",
     ),
+    "puck_model": Choice(
+        "sim_bridge.experiments.hockey.puck_model",
+        "how well the learned puck model knows where pucks go",
+    ),
+}
+LEARNERS = {
+    "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),
 }
 
 
@@ -151,6 +163,13 @@ def folder(text: str) -> str:
     return text
 
 
+def file(text: str) -> str:
+    """The path of a file that exists or can be made, for argparse."""
+    if not text or os.path.isdir(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a file")
+    return text
+
+
 def _whole(text: str, minimum: int) -> int:
     try:
         value = int(text)
@@ -184,6 +203,8 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     experiments = _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, _experiment_arguments)
     if list(chosen[:1]) == ["experiment"] and chosen[1:2] and chosen[1] in EXPERIMENTS:
         _load(EXPERIMENTS[chosen[1]].module).add_arguments(experiments[chosen[1]])
+    learn = commands.add_parser("learn", help="learn a model from recorded episodes and write it to a file")
+    _add_modules(learn, "MODEL", LEARNERS, _learn_arguments)
     bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
     bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
     bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")
@@ -261,6 +282,19 @@ def _experiment_arguments(parser: argparse.ArgumentParser, name: str) -> None:
     )
     parser.add_argument(
         "--resume", action="store_true", help="keep the finished runs of an interrupted call in --out"
+    )
+
+
+def _learn_arguments(parser: argparse.ArgumentParser, name: str) -> None:
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = f"example: vpsto learn {name} --episodes 400 --seed 1 --out {name}.json"
+    parser.add_argument(
+        "--episodes", type=count, default=100, metavar="N", help="to record, a second each (default 100)"
+    )
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of the episodes (default 0)")
+    out = f"output/{name}.json"
+    parser.add_argument(
+        "--out", default=out, metavar="FILE", type=file, help=f"where to write the model (default {out})"
     )
 
 

@@ -42,12 +42,11 @@ class ImpedanceConfig:
         return np.tile([*self.stiffness[:-1], last], arms)
 
 
-class ImpedanceController:
-    """Stiffness control in joint space, within torque and torque-rate limits.
+class JointController:
+    """Stiffness control in joint space with given gains, within torque and torque-rate limits.
 
     Eq. (2.5): u = C(q, qd) qd + g(q) + M(q) qdd_des - K (q - q_des) - D (qd - qd_des). One recursive
-    Newton-Euler pass gives the first three terms. The damping matrix is designed once, at a nominal
-    posture, such that every mode of M and K has the wanted damping ratio there (double diagonalization).
+    Newton-Euler pass gives the first three terms.
 
     Attributes:
         saturated: control cycles in which each joint's torque was cut to its limit, shape (n,).
@@ -56,36 +55,29 @@ class ImpedanceController:
             limits, shape (2, n).
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        nominal_posture: ArrayLike,
-        config: ImpedanceConfig | None = None,
-        *,
-        round_tool: bool = True,
-        period: float = 0.001,
-    ):
-        """Design the gains.
+    def __init__(self, robot: Robot, stiffness: ArrayLike, damping: ArrayLike, *, period: float = 0.001):
+        """Take the gains.
 
         Args:
             robot: model of the arm, or of several arms.
-            nominal_posture: joint positions at which the damping is designed [rad], shape (n,).
-            config: gains.
-            round_tool: whether joint 7 turns a round tool about its own axis.
+            stiffness: joint stiffness [Nm/rad], shape (n,).
+            damping: damping matrix [Nm s/rad], shape (n, n).
             period: control period [s].
 
         Raises:
-            InvalidInputError: the period is not positive.
+            InvalidInputError: the period is not positive, or a gain has another shape.
         """
         if not period > 0.0:
             raise InvalidInputError(f"period must be positive, got {period}")
-        config = config or ImpedanceConfig()
-        self._robot = robot
         n = robot.dof
-        self._stiffness = config.for_arms(n // 7, round_tool)
-        self._damping = critical_damping(
-            robot.mass_matrix(nominal_posture), self._stiffness, config.damping_ratio
-        )
+        self._robot = robot
+        self._stiffness = np.array(stiffness, dtype=float)
+        self._damping = np.array(damping, dtype=float)
+        if self._stiffness.shape != (n,) or self._damping.shape != (n, n):
+            raise InvalidInputError(
+                f"stiffness must have shape ({n},) and damping ({n}, {n}), got {self._stiffness.shape} and "
+                f"{self._damping.shape}"
+            )
         self._limit = np.array(robot.torque_limits)
         self._step = np.array(robot.torque_rate_limits) * period
         self._torque = np.zeros(n)
@@ -126,6 +118,41 @@ class ImpedanceController:
         )  # fmt: skip
         self._fresh = False
         return self._torque
+
+
+class ImpedanceController(JointController):
+    """Stiffness control of an FR3 whose damping is designed for its inertia.
+
+    The damping matrix is designed once, at a nominal posture, such that every mode of M and K has the wanted
+    damping ratio there (double diagonalization).
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        nominal_posture: ArrayLike,
+        config: ImpedanceConfig | None = None,
+        *,
+        round_tool: bool = True,
+        period: float = 0.001,
+    ):
+        """Design the gains.
+
+        Args:
+            robot: model of the arm, or of several arms.
+            nominal_posture: joint positions at which the damping is designed [rad], shape (n,).
+            config: gains.
+            round_tool: whether joint 7 turns a round tool about its own axis.
+            period: control period [s].
+
+        Raises:
+            InvalidInputError: the period is not positive.
+        """
+        config = config or ImpedanceConfig()
+        stiffness = config.for_arms(robot.dof // 7, round_tool)
+        mass_matrix = robot.mass_matrix(nominal_posture)
+        damping = critical_damping(mass_matrix, stiffness, config.damping_ratio)
+        super().__init__(robot, stiffness, damping, period=period)
 
 
 def critical_damping(mass_matrix: NDArray, stiffness: NDArray, ratio: float = 1.0) -> NDArray[np.float64]:

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from sim_bridge.impedance import ImpedanceConfig, ImpedanceController, critical_damping
+from sim_bridge.impedance import (
+    ImpedanceConfig,
+    ImpedanceController,
+    JointController,
+    critical_damping,
+)
 from sim_bridge.scene import Scene
 from sim_bridge.simulation import Simulation
 from sim_bridge.trajectory_follower import TrajectoryCommand
@@ -122,3 +127,14 @@ def test_misuse_is_named(posture):
         ImpedanceConfig(stiffness=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="period"):
         ImpedanceController(fr3_pusher(), posture, period=0.0)
+
+
+def test_gains_can_be_given(posture):
+    robot, zero = fr3_pusher(), np.zeros(7)
+    stiffness, damping = np.arange(1.0, 8.0), np.diag(np.arange(0.1, 0.8, 0.1))
+    controller = JointController(robot, stiffness, damping)
+    q, qd = posture + 1e-3, np.full(7, 1e-2)
+    expected = robot.inverse_dynamics(q, qd, zero) - 1e-3 * stiffness - 1e-2 * damping.diagonal()
+    np.testing.assert_allclose(controller.torque(q, qd, posture, zero, zero), expected, atol=1e-9)
+    with pytest.raises(InvalidInputError, match=r"damping \(7, 7\), got \(7,\) and \(7,\)"):
+        JointController(robot, stiffness, damping.diagonal())

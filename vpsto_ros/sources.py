@@ -13,7 +13,7 @@ PACKAGES = ("vpsto_ros", "sim_bridge")
 """The packages whose code decides what a kernel or an experiment computes."""
 
 _IMPORTED = re.compile(rf"^(?:from|import)\s+((?:{'|'.join(PACKAGES)})\b[\w.]*)", re.MULTILINE)
-_DATA = ("*.xml",)
+_DATA = ("*.xml", "*.json")
 
 
 def digest(files: Iterable[pathlib.Path]) -> str:
@@ -29,7 +29,7 @@ def digest(files: Iterable[pathlib.Path]) -> str:
 
 
 def package_files() -> list[pathlib.Path]:
-    """All Python sources and robot models of these packages, as far as they are installed."""
+    """All Python sources and models of these packages, as far as they are installed."""
     folders = [folder for folder in map(_folder, PACKAGES) if folder is not None]
     return [file for folder in folders for pattern in ("*.py", *_DATA) for file in folder.rglob(pattern)]
 
@@ -37,7 +37,7 @@ def package_files() -> list[pathlib.Path]:
 def dependencies(file: pathlib.Path) -> frozenset[pathlib.Path]:
     """A source file and all those of these packages that it imports at its top, and these import, and so on.
 
-    Where a package is imported from, all of its modules count, and where there are robot models beside
+    Where a package is imported from, all of its modules count, and where there are models beside
     a module, these too.
     """
     known: set[pathlib.Path] = set()

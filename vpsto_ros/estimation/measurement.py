@@ -124,7 +124,7 @@ def finite_array(values: object, *shapes: tuple[int, ...]) -> tuple[NDArray[np.f
     """Values as an array of one of these shapes, and what is wrong with them."""
     try:
         array = np.array(values, dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         return np.empty(0), f"not numbers: {error}"
     if array.shape not in shapes:
         return array, f"expected shape {' or '.join(map(str, shapes))}, got {array.shape}"

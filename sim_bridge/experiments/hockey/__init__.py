@@ -1,0 +1,1 @@
+"""Experiments on the air-hockey table."""
