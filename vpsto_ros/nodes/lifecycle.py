@@ -30,6 +30,7 @@ from vpsto_ros.nodes.conversions import TimeBase
 from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Complaints, Pulse, Report
 from vpsto_ros.nodes.parameters import check_change, declare_parameters, help_text, read_parameters
 
+_SIGNAL_PATIENCE = 0.5  # so long a signal takes at most from the first error to the end of the context [s]
 MAX_AHEAD = 0.5
 """A message stamped farther in the future is refused: it would look fresh long after its sender died [s]."""
 MAX_SILENCE = 1.0
@@ -421,15 +422,31 @@ def run(node_class: type[ManagedNode], name: str, args: list[str] | None = None)
         return _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
-    except Exception:
-        # What publishes or waits while a signal takes the context away ends in an error that means nothing.
-        if rclpy.ok():
+    except Exception as error:
+        # What publishes, takes or waits while a signal ends the context fails in ways that mean nothing.
+        if not _ended_by_signal(error):
             raise
         return 0
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _ended_by_signal(error: BaseException) -> bool:
+    """Whether an error comes of a signal: it says so, or the context ends, which takes a moment."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            return True
+        cause = cause.__cause__ or cause.__context__
+    deadline = time.monotonic() + _SIGNAL_PATIENCE
+    try:
+        while rclpy.ok() and time.monotonic() < deadline:
+            time.sleep(0.01)
+    except KeyboardInterrupt:
+        return True
+    return not rclpy.ok()
 
 
 def _initialize(args: list[str] | None) -> bool:
