@@ -24,9 +24,11 @@ from vpsto_ros.collision.arm_cost import ArmPathCost
 from vpsto_ros.collision.planar_discs import MovingDisc
 from vpsto_ros.contact.end_effectors import EndEffectors
 from vpsto_ros.contact.geometry import PlanarShape
+from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.contact.pushing import PushingModel, push_directions
 from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
 from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
+from vpsto_ros.estimation.puck_filter import PuckFilter
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
@@ -37,14 +39,14 @@ from vpsto_ros.trajectory.key_timing import time_key_positions
 
 
 def run(_arguments: argparse.Namespace | None = None) -> int:
-    """Push a box, track a can, evaluate trajectories, plan among obstacles.
+    """Push a box, track a can, predict a puck, evaluate trajectories, plan among obstacles.
 
     Returns:
         0.
     """
     began = time.perf_counter()
     pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
-    for use in (*pushing, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
+    for use in (*pushing, predict_a_puck, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
     return 0
@@ -85,6 +87,19 @@ def push_by_a_belief() -> None:
     prior = bimanual.belief(2, np.random.default_rng(0))
     path = np.tile(bimanual.START, (1, 2, 1))
     BeliefDynamics(PlanarShape.box(0.1, 0.1), bimanual.BALLS).predict(prior, path)
+
+
+def predict_a_puck() -> None:
+    """The learned model of an air-hockey puck, and its filter."""
+    model, start, spread = PuckModel.load(SHIPPED), np.array([0.0, 0.4, 1.0, 1.5]), 1e-6 * np.eye(4)
+    model.step(start, spread)
+    model.outlook(start[None], spread[None])
+    model.simulate(start[None], 3, np.random.default_rng(0))
+    tracker = PuckFilter(model)
+    for step in range(12):
+        tracker.observe_mallet(0.01 * step, np.array([-0.3, 0.0]), np.array([0.5, 0.0]))
+        tracker.update(0.01 * step, np.array([-0.2 + 0.002 * step, 0.0]))
+    tracker.state(0.5)
 
 
 def evaluate_a_trajectory() -> None:
