@@ -1,6 +1,7 @@
 """The lifecycle that all nodes share: parameters, autostart, timers, guarded subscriptions, a clean end."""
 
 import dataclasses
+import faulthandler
 import gc
 import sys
 import threading
@@ -478,6 +479,8 @@ def _spin(node: ManagedNode) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.owns_process = True
+    if sys.stderr is sys.__stderr__:
+        faulthandler.enable()  # a crash in compiled code says in the log where it happened
     try:
         if node.get_parameter("autostart").value:
             node.start()
