@@ -209,7 +209,10 @@ def test_a_workspace_that_no_tool_gets_behind_is_refused_by_name():
 
 
 def test_a_wide_workspace_is_warmed_up_where_the_arms_reach():
-    planner(workspace_x=(-0.5, 0.5), workspace_y=(-0.5, 0.5)).warm_up()
+    mpc = planner(workspace_x=(-0.5, 0.5), workspace_y=(-0.5, 0.5))
+    mpc.warm_up()
+    pose, tools = mpc._reachable_push()
+    assert mpc.config.contains(pose) and ARMS.contains(tools)
 
 
 def test_searched_motions_stay_within_reach_by_a_margin():

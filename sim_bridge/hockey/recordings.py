@@ -176,16 +176,26 @@ class Recorder:
         for step in range(steps + 1):
             if step:
                 world.advance(PERIOD)
-            mallet = world.mallet_state()
-            pucks.append([*table.to_table(world.puck_pose()[:2]), *world.puck_twist()[:2]])
-            mallets.append([*table.to_table(mallet.position[:2]), *mallet.velocity[:2]])
-            tilts.append(mallet.tilt)
+            pucks.append(puck_state(world))
+            mallets.append(mallet_state(world))
+            tilts.append(world.mallet_state().tilt)
         for _ in range(_LINGER):  # a contact is known when it has ended
             if not world.touching:
                 break
             world.step()
         recording = PuckRecording(PERIOD, np.array(pucks), np.array(mallets))
         return Episode(kind, recording, np.array(tilts), start, tuple(world.contacts))
+
+
+def puck_state(world: AirHockeyWorld) -> NDArray[np.float64]:
+    """True (x, y, vx, vy) of the puck in the table frame [m, m/s]."""
+    return np.concatenate([table.to_table(world.puck_pose()[:2]), world.puck_twist()[:2]])
+
+
+def mallet_state(world: AirHockeyWorld) -> NDArray[np.float64]:
+    """The same of the mallet's centre."""
+    state = world.mallet_state()
+    return np.concatenate([table.to_table(state.position[:2]), state.velocity[:2]])
 
 
 def kind_of(index: int) -> str:
@@ -205,13 +215,29 @@ def strike_command(strike: Strike, robot: Robot) -> TrajectoryCommand:
     places, rates = strike.motion(times)
     places = table.to_base(places)
     q = solve(robot, [*places[0], height], None, START_JOINTS)
+    points = np.column_stack([places, np.full(count, height)])
+    rows, speeds = joints_along(robot, q, points, np.column_stack([rates, np.zeros(count)]))
+    return TrajectoryCommand(robot.joint_names, 0.0, times, rows, speeds)
+
+
+def joints_along(
+    robot: Robot, q: NDArray, points: NDArray, rates: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint positions and velocities, each (K, n), that lead the tip through points with the least motion.
+
+    Args:
+        robot: the arm.
+        q: joint positions near the first point, shape (n,) [rad].
+        points: of the tip, base frame, close to each other, shape (K, 3) [m].
+        rates: its velocities there, shape (K, 3) [m/s].
+    """
     rows, speeds = [], []
-    for place, rate in zip(places, rates, strict=True):
+    for point, rate in zip(points, rates, strict=True):
         for _ in range(3):
-            q = q + np.linalg.pinv(robot.jacobian(q)[:3]) @ ([*place, height] - robot.forward(q)[0])
+            q = q + np.linalg.pinv(robot.jacobian(q)[:3]) @ (point - robot.forward(q)[0])
         rows.append(q)
-        speeds.append(np.linalg.pinv(robot.jacobian(q)[:3]) @ [*rate, 0.0])
-    return TrajectoryCommand(robot.joint_names, 0.0, times, np.array(rows), np.array(speeds))
+        speeds.append(np.linalg.pinv(robot.jacobian(q)[:3]) @ rate)
+    return np.array(rows), np.array(speeds)
 
 
 def mallet_contacts(episode: Episode) -> list[PuckContact]:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.hockey import table
+from sim_bridge.hockey.recordings import TABLE, joints_along, mallet_state, puck_state
 from sim_bridge.hockey.scene import START_JOINTS
 from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
-from vpsto_ros.contact.puck import HockeyTable
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
 
@@ -21,7 +21,6 @@ MALLET_PERIOD = 0.01
 MALLET_STD = (3e-4, 5e-3)
 """How well: position [m], velocity [m/s]."""
 
-_TABLE = HockeyTable()
 _MOUTH = 0.01  # so near a goal an episode ends [m]
 _DRAG = 0.5  # only to place pucks so that they meet the mallet [1/s]
 
@@ -74,10 +73,10 @@ def record(episode: Episode) -> Log:
         _begin_bounces(world, rng)
     rows, frames = [], []
     for _ in range(round(1e3 * DURATION)):
-        rows.append([world.time, *_puck(world), *_mallet(world)])
+        rows.append([world.time, *puck_state(world), *mallet_state(world)])
         frames += [(world.time, f.stamp, *table.to_table(f.pose[:2])) for f in world.camera_frames()]
         world.step()
-        if _at_a_goal(_puck(world)):
+        if _at_a_goal(puck_state(world)):
             break
     return _log(world, np.array(rows), np.array(frames).reshape(-1, 4), rng)
 
@@ -97,16 +96,7 @@ def _log(world: AirHockeyWorld, rows: NDArray, frames: NDArray, rng: np.random.G
 
 def _at_a_goal(puck: NDArray) -> bool:
     """Whether the puck enters a goal or meets a post, which the model of the puck does not know."""
-    return bool(abs(puck[0]) > _TABLE.reach[0] - _MOUTH and abs(puck[1]) < 0.5 * _TABLE.goal_width + _MOUTH)
-
-
-def _puck(world: AirHockeyWorld) -> NDArray[np.float64]:
-    return np.concatenate([table.to_table(world.puck_pose()[:2]), world.puck_twist()[:2]])
-
-
-def _mallet(world: AirHockeyWorld) -> NDArray[np.float64]:
-    state = world.mallet_state()
-    return np.concatenate([table.to_table(state.position[:2]), state.velocity[:2]])
+    return bool(abs(puck[0]) > TABLE.reach[0] - _MOUTH and abs(puck[1]) < 0.5 * TABLE.goal_width + _MOUTH)
 
 
 def _begin_bounces(world: AirHockeyWorld, rng: np.random.Generator) -> None:
@@ -126,7 +116,7 @@ def _begin_hit(world: AirHockeyWorld, rng: np.random.Generator) -> None:
         command, run = strike(way, acceleration, speed, time + 0.05)
         aside = angle + rng.uniform(-0.6, 0.6)
         met = start + run(time) * way
-        met += (_TABLE.contact_distance - 0.003) * np.array([math.cos(aside), math.sin(aside)])
+        met += (TABLE.contact_distance - 0.003) * np.array([math.cos(aside), math.sin(aside)])
         velocity = rng.uniform(0.0, 0.8) * _direction(rng)
         # A puck that starts here is at the place of the hit in time, and has that velocity then.
         growth = math.exp(_DRAG * time)
@@ -157,22 +147,22 @@ def strike(way: NDArray, acceleration: float, speed: float, braking: float):
         the trajectory, and a function that says how far the mallet has come at a time [s] before braking.
     """
     robot, q, period = iiwa14(), np.array(START_JOINTS), 0.01
-    start, s, v, k = robot.forward(q)[0], 0.0, 0.0, 0
-    rows, rates = [q], [np.zeros(7)]
-    heading = np.array([*way, 0.0])
-    while k * period < braking or v > 1e-9:
+    s, v, gain = 0.0, 0.0, acceleration * period
+    ways: list[float] = []
+    speeds: list[float] = []
+    while len(ways) * period < braking or v > 1e-9:
         s += 0.5 * period * v
-        gain = acceleration * period
-        v = min(v + gain, speed) if k * period < braking else max(v - gain, 0.0)
-        s, k = s + 0.5 * period * v, k + 1
-        for _ in range(3):
-            q = q + np.linalg.pinv(robot.jacobian(q)[:3]) @ (start + s * heading - robot.forward(q)[0])
-        rows.append(q)
-        rates.append(np.linalg.pinv(robot.jacobian(q)[:3]) @ (v * heading))
+        v = min(v + gain, speed) if len(ways) * period < braking else max(v - gain, 0.0)
+        s += 0.5 * period * v
+        ways.append(s)
+        speeds.append(v)
+    heading = np.array([*way, 0.0])
+    points = robot.forward(q)[0] + np.outer(ways, heading)
+    rows, rates = joints_along(robot, q, points, np.outer(speeds, heading))
 
     def run(time: float) -> float:
         rising = min(time, speed / acceleration)
         return 0.5 * acceleration * rising**2 + speed * (time - rising)
 
-    times = period * np.arange(len(rows))
-    return TrajectoryCommand(JOINT_NAMES, 0.0, times, np.array(rows), np.array(rates)), run
+    times = period * np.arange(len(rows) + 1)
+    return TrajectoryCommand(JOINT_NAMES, 0.0, times, np.vstack([q, rows]), np.vstack([0.0 * q, rates])), run

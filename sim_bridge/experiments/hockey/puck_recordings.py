@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.experiments.hockey.puck_episodes import Episode, Log, record
-from vpsto_ros.contact.puck import HockeyTable, PuckModel
+from sim_bridge.hockey.recordings import TABLE
+from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.contact.puck_learning import PuckRecording, learn
 from vpsto_ros.estimation.puck_filter import PuckFilterConfig
 from vpsto_ros.estimation.puck_motion import MalletTrack, hit_time
@@ -16,7 +17,6 @@ from vpsto_ros.estimation.puck_motion import MalletTrack, hit_time
 PERIOD = 0.025
 """Of a step [s]; contacts with the mallet last about 18.5 ms."""
 _STEPS = round(1e3 * PERIOD)
-_TABLE = HockeyTable()
 _LEAST_LEAVING = 0.15  # slower, how long a contact lasted cannot be told [m/s]
 
 
@@ -40,7 +40,7 @@ def fit(recordings: list[PuckRecording]) -> tuple[PuckModel, PuckFilterConfig]:
     """The model, and the options of the filter with how long contacts were."""
     wall, mallet = _contact_times(recordings, False), _contact_times(recordings, True)
     config = PuckFilterConfig(wall_contact=_timing(wall), mallet_contact=_timing(mallet))
-    return learn(recordings, _TABLE), config
+    return learn(recordings, TABLE), config
 
 
 def _timing(times: NDArray) -> tuple[float, float]:
@@ -96,19 +96,19 @@ def _met_wall(recording: PuckRecording) -> tuple[float, NDArray, NDArray] | None
     """When a wall was met, its normal and its velocity; None if none was, or more than one."""
     before, after = recording.puck
     end = before[:2] + recording.period * before[2:]
-    beyond = np.flatnonzero((np.abs(end) > _TABLE.reach) & (before[2:] * after[2:] < 0.0))
+    beyond = np.flatnonzero((np.abs(end) > TABLE.reach) & (before[2:] * after[2:] < 0.0))
     if len(beyond) != 1 or _met_mallet(recording) is not None:
         return None
     axis, normal = beyond[0], np.zeros(2)
     side = np.sign(end[axis])
     normal[axis] = -side
-    return float((side * _TABLE.reach[axis] - before[axis]) / before[2 + axis]), normal, np.zeros(2)
+    return float((side * TABLE.reach[axis] - before[axis]) / before[2 + axis]), normal, np.zeros(2)
 
 
 def _met_mallet(recording: PuckRecording) -> tuple[float, NDArray, NDArray] | None:
     """When the mallet was met, the normal from it and its velocity; None if it was not."""
     relative = recording.puck[0] - recording.mallet[0]
-    time = hit_time(relative, _TABLE.contact_distance)
+    time = hit_time(relative, TABLE.contact_distance)
     if time > recording.period:
         return None
     normal = relative[:2] + time * relative[2:]
