@@ -109,7 +109,7 @@ class AirHockeyWorld:
         start, gains = np.array(self.scene.joints), gains or ArmGains()
         self.follower = TrajectoryFollower(self.robot.limits, self.robot.joint_names, start, follower)
         self.controller = JointController(
-            self.robot, gains.stiffness, np.diag(gains.damping), period=TIMESTEP
+            self.robot, gains.stiffness, np.diag(gains.damping), period=TIMESTEP, implicit=True
         )
         self.camera = Camera(camera, np.random.default_rng(seed))
         self.limits = LimitMonitor(self.robot.limits)
