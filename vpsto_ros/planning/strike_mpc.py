@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.vpsto import VpstoConfig
-from vpsto_ros.planning.mpc import OnlineConfig, OnlineVpsto
+from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
 from vpsto_ros.planning.play_motions import ArmState, Play, PlayMotion
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import extended, resting
@@ -275,26 +275,37 @@ class StrikeMpc(ReferencePlanner):
         if fresh:
             self._approach.accept(None)
             self._return.accept(None)
-        whole, result = None if fresh else self._running, None
+        whole = None if fresh else self._running
         for _ in range(self.config.first_rounds if fresh else 1):
             target = self._target(cell, contact, now, whole)
             if target is None:
                 return self._refuse(now, takeover, fresh, "the mallet cannot be that fast there")
-            motion = PlayMotion(self.play, begin, target, self.table.start(cell), self.table.config.run_up)
-            result = self._plan(self._approach, motion)
-            if result.trajectory is None:
-                why = "no motion into this contact keeps limits and rules"
-                return self._refuse(now, takeover, fresh, why)
             try:
-                onwards = self._follow_through(target)
+                result, approach, onwards = self._through(begin, target, self.table.start(cell))
             except InfeasibleError as error:
                 return self._refuse(now, takeover, fresh, str(error))
-            whole = self._joined(now, result.trajectory.followed_by(onwards))
-            self._approach.accept(result.trajectory)
+            whole = self._joined(now, approach.followed_by(onwards))
         self.contact, self._cell = contact, cell
         iterations = result.search.iterations if result.search is not None else 0
         path = self._tool(whole(np.linspace(whole.start_time, whole.end_time, 40)))
         return MpcStep(whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path)
+
+    def _through(
+        self, begin: ArmState, target: ArmState, run_up: NDArray
+    ) -> tuple[OnlineResult, Trajectory, Trajectory]:
+        """A motion into a touch and the one after it.
+
+        Raises:
+            InfeasibleError: none is found that keeps limits and rules.
+        """
+        result = self._plan(
+            self._approach, PlayMotion(self.play, begin, target, run_up, self.table.config.run_up)
+        )
+        if result.trajectory is None:
+            raise InfeasibleError("no motion into this contact keeps limits and rules")
+        onwards = self._follow_through(target)
+        self._approach.accept(result.trajectory)
+        return result, result.trajectory, onwards
 
     def _refuse(self, now: float, takeover: float, fresh: bool, why: str) -> MpcStep:
         """Go on with a contact that has been planned before; with a new one, do without."""
@@ -319,7 +330,8 @@ class StrikeMpc(ReferencePlanner):
         mallet, aside, rate = contact.mallet, np.zeros(2), np.zeros(2)
         if motion is not None and self._swing is not None:
             tilt = self.config.tilt
-            aside, rate = tilt.displacement(tilt.along(motion, contact.time, *self._swing))
+            begin, state = self._swing
+            aside, rate = tilt.displacement(tilt.along(motion, contact.time, begin, state))
         place = mallet[:2] + self.table.rules.table - aside
         found = self.table.contact(cell, place, mallet[2:] - rate)
         if found is None or (np.abs(found[1]) > self.play.limits.velocity).any():
@@ -352,6 +364,6 @@ class StrikeMpc(ReferencePlanner):
         self._return.accept(result.trajectory)
         return result.trajectory
 
-    def _plan(self, online: OnlineVpsto, motion: PlayMotion):
+    def _plan(self, online: OnlineVpsto, motion: PlayMotion) -> OnlineResult:
         online.config = self._first[online] if online.previous is None else self._usual[online]
         return online.step(motion)
