@@ -164,9 +164,9 @@ def after_hit(
     """Gaussians of the puck after hits, with what is not known before them, to first order.
 
     Deviation: the thesis begins with Q_3 alone. Here the state of the puck is uncertain, too, and the mallet
-    is off its place. What shifts them against each other across the motion turns the normal of the contact, by
-    the shift over the distance of their centres; what does so along the motion changes the time of the touch,
-    and with it the place of a puck that moves sideways.
+    is off its place. What shifts them against each other across the motion turns the normal of the contact,
+    by the shift over the distance of their centres; what does so along the motion changes the time of the
+    touch, and with it the place of a puck that moves sideways.
 
     Args:
         model: of the puck.
