@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 FORMAT = "vpsto_ros shooting policies 1"
-SHIPPED = pathlib.Path(__file__).parent / "models" / "shooting.npz"
+SHIPPED = pathlib.Path(__file__).parent / "models" / "shooting_policy.npz"
 """The policies of the three settings, which come with the package; their origin is in the file."""
 HIDDEN = 128
 LAYERS = ("first", "first_bias", "second", "second_bias", "last")
