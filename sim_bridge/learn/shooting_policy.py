@@ -157,6 +157,6 @@ def describe(setting: str, figures: dict[str, Any]) -> str:
     """The figures of a training in words."""
     return (
         f"{setting}: {figures['states']} states, {figures['allowed']:.0%} with a shot that keeps the "
-        f"constraint; loss {figures['first_loss']:.2f} to {figures['last_loss']:.2f} in {figures['epochs']} epochs, "
-        f"{figures['training_s']:.0f} s"
+        f"constraint; loss {figures['first_loss']:.2f} to {figures['last_loss']:.2f} in {figures['epochs']} "
+        f"epochs, {figures['training_s']:.0f} s"
     )
