@@ -124,6 +124,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
+    "shooting_policy": Choice(
+        "sim_bridge.experiments.hockey.shooting_policy",
+        "the energy-based shooting policy and direct search",
+    ),
 }
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),

@@ -23,6 +23,8 @@ from vpsto_ros.planning.shooting_times import ContactTimes, Round
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
 
+SEARCHING = "contact times are being searched"
+"""Why there is no shot yet, before the first round is over."""
 _TURNS = np.array([0.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0])  # of a chosen angle in a step, of the largest
 
 
@@ -67,10 +69,11 @@ class ShootingPlanner:
 
     def forget(self) -> None:
         """Drop the shot and begin to search anew."""
-        self.committed, self.reason = None, "contact times are being searched"
+        self.committed, self.reason = None, SEARCHING
         self._share = 1.0  # of the largest speed that the chosen shot has
         self._round: Round | None = None
         self._samples: PolicySamples | None = None
+        self._found_wrong = ""  # with what the last round has found
 
     def plan(self, now: float, puck: PuckState | None, joints: ArrayLike) -> Shot | None:
         """A step of the planner.
@@ -155,13 +158,20 @@ class ShootingPlanner:
         """The shot, and what it would be if it were turned; empty if the arm can do none of this."""
         angles = shot.angle + self.config.angle_step * _TURNS
         if self._policy is not None:
-            angle, self._samples = self._policy.infer(mean[0], self._samples, self._rng)
-            angles = np.array([shot.angle, angle])
+            angles = np.array([shot.angle, self._proposal(self._policy, mean[0])])
         largest = self.search.speeds(np.repeat(mean[:, :2], len(angles), axis=0), angles)
         kept = largest > 0.0
         rows = np.zeros(kept.sum(), dtype=int)
         times = np.full(len(rows), shot.time)
         return Strokes(times, mean[rows], covariance[rows], angles[kept], self._share * largest[kept])
+
+    def _proposal(self, policy: ShootingPolicy, state: NDArray) -> float:
+        """The angle by the policy: a step of Algorithm 2 from the samples of the step before, (5.3.4)."""
+        if self._samples is None:
+            angle, self._samples = policy.solve(state, self.config.policy_steps, self._rng)
+        else:
+            angle, self._samples = policy.infer(state, self._samples, self._rng)
+        return angle
 
     def _preferred(self, angles: NDArray, outlook: ShotOutlook, angle: float) -> int | None:
         """Which of some angles to take: the one chosen before unless another gains; None if none is good."""
@@ -188,7 +198,7 @@ class ShootingPlanner:
                 self._commit(shot)
         if current.times.size:
             if self.committed is None:
-                self.reason = "contact times are being searched"
+                self.reason = self._found_wrong or SEARCHING
             return
         self._round = None
         if self.committed is None:
@@ -212,6 +222,7 @@ class ShootingPlanner:
             if not reason:
                 return
         self._drop(reason)
+        self._found_wrong = reason
 
     def _commit(self, shot: Shot) -> None:
         largest = float(self.search.speeds(shot.puck[None, :2], np.array([shot.angle]))[0])

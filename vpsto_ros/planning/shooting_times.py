@@ -107,7 +107,7 @@ class ContactTimes:
         assert self.policy is not None
         steps = self.search.config.policy_steps
         slots = np.flatnonzero(speeds.any(axis=1))
-        angles = np.array([self.policy.angle(means[slot], steps, self._rng) for slot in slots])
+        angles = np.array([self.policy.solve(means[slot], steps, self._rng)[0] for slot in slots])
         near = np.argmin(np.abs(self.search.angles - angles[:, None]), axis=1)
         largest = self.search.speeds(means[slots, :2], angles)
         possible = (largest > 0.0) & (speeds[slots, near] > 0.0)

@@ -175,7 +175,8 @@ def train(
             share = 0.5 * (1.0 + np.cos(np.pi * adam.steps / total))
             adam.step(weights, gradients, config.last_rate + share * (config.rate - config.last_rate))
             losses.append(loss * len(rows))
-        yield dataclasses.replace(model, weights=weights), float(np.sum(losses) / count)
+        trained = dataclasses.replace(model, weights={name: weights[name].copy() for name in LAYERS})
+        yield trained, float(np.sum(losses) / count)
 
 
 def loss_and_gradients(
