@@ -14,6 +14,7 @@ from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig, Shootin
 from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
 
 MODEL, STRIKES = PuckModel.load(SHIPPED), StandInStrikes()
+DISTANCE = MODEL.table.contact_distance
 COVARIANCE = np.diag([2e-3, 2e-3, 1e-2, 1e-2]) ** 2
 PUCKS = np.array(
     [[-0.4, 0.1, 0.0, 0.0], [-0.55, -0.25, 0.2, 0.3], [-0.3, 0.0, -0.4, 0.1], [-0.5, 0.3, 0.0, -0.3]]
@@ -34,14 +35,12 @@ def sampled_goals(puck, angle, speed, covariance, aim_std, speed_std, rng, count
     tangent = np.array([-normal[1], normal[0]])
     pucks = puck + rng.standard_normal((count, 4)) @ np.linalg.cholesky(covariance + 1e-15 * np.eye(4)).T
     speeds = speed + speed_std * rng.standard_normal(count)
-    mallets = np.hstack([
-        puck[:2] - MODEL.table.contact_distance * normal + aim_std * np.outer(rng.standard_normal(count), tangent),
-        np.outer(speeds, normal),
-    ])  # fmt: skip
+    places = puck[:2] - DISTANCE * normal + aim_std * np.outer(rng.standard_normal(count), tangent)
+    mallets = np.hstack([places, np.outer(speeds, normal)])
     back = 0.1  # both begin a while before
     for states in (pucks, mallets):
         states[:, :2] -= back * states[:, 2:]
-    times = np.array([hit_time(p - m, MODEL.table.contact_distance) for p, m in zip(pucks, mallets, strict=True)])
+    times = np.array([hit_time(p - m, DISTANCE) for p, m in zip(pucks, mallets, strict=True)])
     for states in (pucks, mallets):
         states[:, :2] += times[:, None] * states[:, 2:]
     mean, spread = MODEL.hit(pucks, mallets)
@@ -161,10 +160,10 @@ def test_a_run_up_needs_room():
 
 def test_scores_put_what_is_allowed_first():
     objective = ShootingObjective(1.0, 0.2, 0.5, 1)
-    outlook = MODEL.shots(PUCKS[0], COVARIANCE, np.array([[-0.48, 0.1, v, w] for v in (0.5, 1.0) for w in (0, 0.7)]))
+    mallets = np.array([[-0.48, 0.1, v, w] for v in (0.5, 1.0) for w in (0, 0.7)])
     outlook = dataclasses.replace(
-        outlook, goal=np.array([0.9, 0.6, 0.4, 0.0]), speed=np.array([1.0, 2.0, 3.0, math.nan]),
-        banks=np.array([0, 1, 1, 2]),
+        MODEL.shots(PUCKS[0], COVARIANCE, mallets), goal=np.array([0.9, 0.6, 0.4, 0.0]),
+        speed=np.array([1.0, 2.0, 3.0, math.nan]), banks=np.array([0, 1, 1, 2]),
     )  # fmt: skip
     np.testing.assert_allclose(objective.values(outlook), [1.1, 1.0, 1.0, 0.0])
     np.testing.assert_array_equal(objective.allowed(outlook), [False, True, False, False])

@@ -22,8 +22,8 @@ class Comparison:
         state: shape (4,).
         direct: the best shot of direct search, None if none keeps the constraints.
         policy: the shot at the policy's angle, None if the arm cannot make it or it misses the goal line.
-        ratio: objective of the policy's over that of direct search: 0 if it breaks a constraint, NaN if direct
-            search finds no shot.
+        ratio: objective of the policy's over that of direct search: 0 if it breaks a constraint, NaN if
+            direct search finds no shot.
         direct_s: duration of the search [s].
         inference_s: durations of the steps of Algorithm 2, shape (STEPS,) [s].
     """

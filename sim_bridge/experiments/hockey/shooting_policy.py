@@ -97,8 +97,10 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{text}\nresults in {folder}")
     missed = missed_targets(summary)
     ratios = ", ".join(f"{summary['settings'][s]['objective_ratio']:.3f} ({s})" for s in SETTINGS)
-    times = f"{summary['inference_ms_p50']:.2f} ms per step, direct search {summary['direct_search_ms_p50']:.2f} ms"
-    return print_verdict(not missed, "; ".join(missed) or f"policies reach {ratios} of the objective in {times}")
+    step, search = summary["inference_ms_p50"], summary["direct_search_ms_p50"]
+    times = f"a step takes {step:.2f} ms, direct search {search:.2f} ms"
+    good = f"policies reach {ratios} of the objective; {times}"
+    return print_verdict(not missed, "; ".join(missed) or good)
 
 
 def training_time(policies: dict[str, ShootingPolicy]) -> float:

@@ -65,9 +65,9 @@ def _shots(axes: Any, search: ShotSearch, policy: ShootingPolicy, setting: str) 
         *pucks[:, :2].T, speeds * np.cos(angles), speeds * np.sin(angles), speeds, cmap="viridis",
         angles="xy", scale_units="xy", scale=8.0, width=0.005, clim=(1.0, 3.0),
     )  # fmt: skip
-    objective = SETTINGS[setting]
+    wanted = SETTINGS[setting]
     axes.set(aspect="equal", xlim=(-x - 0.02, x + 0.02), ylim=(-y - 0.02, y + 0.02), ylabel="y [m]")
-    axes.set_title(f"{setting}: λ1 = {objective.lambda1:g}, λ2 = {objective.lambda2:g}, β = {objective.beta:g}")
+    axes.set_title(f"{setting}: λ1 = {wanted.lambda1:g}, λ2 = {wanted.lambda2:g}, β = {wanted.beta:g}")
     return arrows
 
 
