@@ -1,4 +1,4 @@
-"""An agent that shoots at air hockey: filter, contact planner and MPC in one, for any simulator or robot (ch. 5).
+"""An agent that shoots at air hockey (ch. 5): filter, contact planner and MPC in one, for any robot.
 
 It needs neither ROS nor a simulator. What it is given and what it returns is in the robot's base frame.
 

@@ -23,6 +23,7 @@ from vpsto_ros.planning.shooting_times import ContactTimes, Round
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
 
+_SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
 _TURNS = np.array([0.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0])  # of a chosen angle in a step, of the largest
 
 
@@ -203,8 +204,8 @@ class ShootingPlanner:
         """Choose the best shot of a round that is still possible."""
         reason = finished.objection[1]
         for shot in sorted(finished.shots, key=self._worth, reverse=True):
-            lead = self.search.strikes.lead(joints, shot.puck[None, :2], np.array([shot.angle]))
-            if lead[0] > shot.time - now:
+            there, ahead = (shot.puck[None, :2], np.array([shot.angle])), np.array([shot.time - now])
+            if self.search.strikes.timely_speeds(joints, *there, ahead)[0] < _SPEED_LEFT * shot.speed:
                 reason = "the arm cannot be there in time"
                 continue
             self._commit(shot)

@@ -111,7 +111,10 @@ class ContactTimes:
         possible = (largest > 0.0) & (speeds[slots, near] > 0.0)
         if not possible.any():
             return None
-        slots, angles, largest = slots[possible], angles[possible], largest[possible]
+        slots, angles, near = slots[possible], angles[possible], near[possible]
+        # Where time is short the speeds of the grid are less than the largest.
+        share = speeds[slots, near] / self.search.strikes.speeds(means[slots, :2], self.search.angles[near])
+        largest = share * largest[possible]
         strokes = Strokes(times[slots], means[slots], covariances[slots], angles, largest)
         outlook = self.search.outlook(strokes)
         return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes.time, outlook))))
@@ -155,14 +158,13 @@ class ContactTimes:
             ],
             6,
         )
-        timely = there.copy()
-        rows = np.flatnonzero(there)
+        rows, timely = np.flatnonzero(there), np.zeros(len(puck))
         if rows.size:
-            lead = self.search.strikes.lead(joints, puck[rows], angles[rows]) + self.search.config.lead_margin
-            timely[rows] = lead <= np.repeat(available, shape[1])[rows]
+            spare = np.repeat(available, shape[1])[rows] - self.search.config.lead_margin
+            timely[rows] = self.search.strikes.timely_speeds(joints, puck[rows], angles[rows], spare)
             if not timely.any():
                 objection = (9, "the arm cannot be there in time")
-        return np.where(timely, speeds, 0.0).reshape(shape), there.reshape(shape), objection
+        return timely.reshape(shape), there.reshape(shape), objection
 
     def _fresh(self, current: Round, places: NDArray, possible: NDArray) -> NDArray[np.bool_]:
         """Which of the possible directions (K, A) have not been searched at nearly the same place (K, 2)."""

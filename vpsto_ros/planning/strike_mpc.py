@@ -19,7 +19,7 @@ from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
 from vpsto_ros.planning.play_motions import ArmState, Play, PlayMotion
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import extended, resting
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.strikes import Cell, StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.robot.mallet_tilt import MalletTilt
@@ -163,7 +163,7 @@ class StrikeMpc(ReferencePlanner):
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
         self.contact: MalletContact | None = None
-        self._cell: tuple[int, int, int] | None = None
+        self._cell: Cell | None = None
         self._approach.accept(None)
         self._return.accept(None)
 
@@ -286,7 +286,9 @@ class StrikeMpc(ReferencePlanner):
     def _strike(self, now: float, takeover: float, contact: MalletContact) -> MpcStep:
         """Plan into the touch, on, and home."""
         fresh = not contact.continues(self.contact)
-        cell = self.table.cell(contact.mallet) if fresh or self._cell is None else self._cell
+        cell = self._cell
+        if fresh or cell is None:
+            cell = self.table.cell(contact.mallet, self._running(now))
         if cell is None:
             return self._refuse(now, takeover, fresh, "there is no strike in the table for this contact")
         begin = self._begin(takeover, contact, fresh)
@@ -305,7 +307,7 @@ class StrikeMpc(ReferencePlanner):
         return MpcStep(whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path)
 
     def _through(
-        self, now: float, begin: ArmState, cell: tuple[int, int, int], contact: MalletContact,
+        self, now: float, begin: ArmState, cell: Cell, contact: MalletContact,
         motion: Trajectory | None,
     ) -> tuple[OnlineResult, Trajectory]:  # fmt: skip
         """The running motion, one from it into a touch, and the one after that.
@@ -346,7 +348,7 @@ class StrikeMpc(ReferencePlanner):
         return ArmState(start, position, velocity)
 
     def _target(
-        self, cell: tuple[int, int, int], contact: MalletContact, now: float, motion: Trajectory | None
+        self, cell: Cell, contact: MalletContact, now: float, motion: Trajectory | None
     ) -> ArmState:
         """The arm's state at the touch, with the mallet swinging as a motion much like it makes it.
 
