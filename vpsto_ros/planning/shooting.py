@@ -129,7 +129,7 @@ class ShootingPlanner:
         """Weigh the shot anew for what is now known of the puck; what speaks against it, else empty."""
         ahead = np.array([max(shot.time - puck.stamp, 0.0)])
         mean, covariance = self.search.model.predict(puck.mean, puck.covariance, ahead)
-        _, (_, objection) = self._times.places(mean, covariance)
+        _, (_, objection) = self._times.places(mean, covariance, chosen=True)
         if objection:
             return objection
         if math.dist(mean[0, :2], shot.puck[:2]) > self.config.largest_jump:

@@ -16,6 +16,8 @@ Objection = tuple[int, str]
 """What rules a shot out, and how far it had come until then; the farthest one is told."""
 NO_OBJECTION: Objection = (-1, "")
 _SOONEST = 0.05  # no touch is planned so soon [s]
+_SURE = 2.0  # standard deviations of its place by which a puck must be within reach
+_BEYOND = 0.01  # how far beyond the reach a chosen shot may get [m]
 _RIM = 0.02  # estimates of a puck at a rim may be so far in it [m]
 _AT_REST = 0.03  # slower pucks do not move away [m/s]
 
@@ -119,17 +121,24 @@ class ContactTimes:
         outlook = self.search.outlook(strokes)
         return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes.time, outlook))))
 
-    def places(self, means: NDArray, covariances: NDArray) -> tuple[NDArray, Objection]:
-        """At which contact times (K,) the puck is where it could be struck, and the objection if at none."""
+    def places(
+        self, means: NDArray, covariances: NDArray, *, chosen: bool = False
+    ) -> tuple[NDArray, Objection]:
+        """At which contact times (K,) the puck is where it could be struck, and the objection if at none.
+
+        It must be there for all that is known; a shot that has been chosen may be a little beyond the reach.
+        """
         x, y, vx = means[:, 0], means[:, 1], means[:, 2]
+        inside = [-_BEYOND if chosen else _SURE * np.sqrt(covariances[:, i, i]) for i in (0, 1)]
         std, largest = _largest_std(covariances), self.search.config.largest_std
-        far, close = x > self._high[0], x < self._low[0]
+        far, close = x > self._high[0] - inside[0], x < self._low[0] + inside[0]
+        beside = (y < self._low[1] + inside[1]) | (y > self._high[1] - inside[1])
         checks = [
             (~np.logical_or.accumulate(self.off_table(means)), "the puck is leaving the table"),
             (~np.logical_or.accumulate(far & (vx > _AT_REST)), "the puck is out of reach and moves away"),
             (~far, "the puck is out of the arm's reach"),
             (~close, "the puck is behind where the mallet can strike"),
-            ((y >= self._low[1]) & (y <= self._high[1]), "the puck is too near to a side wall"),
+            (~beside, "the puck is too near to a side wall"),
             (std <= largest, f"where the puck will be is uncertain by {1e3 * std.min():.0f} mm"),
         ]
         return _narrowed(np.ones(len(means), dtype=bool), checks, 0)
