@@ -161,7 +161,7 @@ class HockeyAgent:
         Nothing that a camera delivers raises: what is wrong with it is ignored, and the message says so.
 
         Raises:
-            InvalidInputError: the joint state is not 7 finite positions and velocities, or time is not finite.
+            InvalidInputError: the joint state is not 7 finite positions and velocities, or time not finite.
         """
         now = float(observation.time)
         q = np.array(observation.joint_position, dtype=float)
@@ -174,7 +174,7 @@ class HockeyAgent:
         contact = MalletContact(shot.time, shot.mallet) if shot is not None else None
         step = self.mpc.step(now, q, qd, contact)
         if shot is not None and not step.valid:
-            self.planner.forget()
+            self.planner.refuse()
             complaints.append(f"shot refused: {step.message}")
         self.mpc.accept(step)
         reasons = complaints if shot is not None else [*complaints, self.planner.reason]

@@ -290,8 +290,9 @@ class StrikeMpc(ReferencePlanner):
         if fresh or cell is None:
             cell = self.table.cell(contact.mallet, self._running(now))
         if cell is None:
-            return self._refuse(now, takeover, fresh, "there is no strike in the table for this contact")
+            return self._refuse(now, "there is no strike in the table for this contact")
         begin = self._begin(takeover, contact, fresh)
+        before = self._approach.previous, self._return.previous
         if fresh:
             self._approach.accept(None)
             self._return.accept(None)
@@ -300,7 +301,9 @@ class StrikeMpc(ReferencePlanner):
             for _ in range(self.config.first_rounds - 1 if fresh else 0):
                 result, whole = self._through(now, begin, cell, contact, whole)
         except InfeasibleError as error:
-            return self._refuse(now, takeover, fresh, str(error))
+            self._approach.accept(before[0])
+            self._return.accept(before[1])
+            return self._refuse(now, str(error))
         self.contact, self._cell = contact, cell
         iterations = result.search.iterations if result.search is not None else 0
         path = self._tool(whole(np.linspace(whole.start_time, whole.end_time, 40)))
@@ -331,11 +334,9 @@ class StrikeMpc(ReferencePlanner):
         self._approach.accept(result.trajectory)
         return result, self._joined(now, result.trajectory.followed_by(onwards))
 
-    def _refuse(self, now: float, takeover: float, fresh: bool, why: str) -> MpcStep:
-        """Go on with a contact that has been planned before; with a new one, do without."""
-        withdraw = fresh and self.contact is not None
-        step = self._withdraw(now, takeover) if withdraw else self._go_on(now)
-        return dataclasses.replace(step, valid=False, message=why)
+    def _refuse(self, now: float, why: str) -> MpcStep:
+        """Go on with what runs: it is whole, and ends at home."""
+        return dataclasses.replace(self._go_on(now), valid=False, message=why)
 
     def _begin(self, takeover: float, contact: MalletContact, fresh: bool) -> ArmState:
         """Where planning begins: at the takeover, or later while there is time to wait."""
