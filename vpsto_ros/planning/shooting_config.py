@@ -30,10 +30,11 @@ class Strikes(Protocol):
     def speeds(self, puck: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Largest speeds (B,) [m/s] at places of the puck (B, 2) in directions (B,); 0 where none is."""
 
-    def lead(
-        self, joints: NDArray[np.float64], puck: NDArray[np.float64], angles: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Least times (B,) [s] from a posture at rest (7,) into such touches."""
+    def timely_speeds(
+        self, joints: NDArray[np.float64], puck: NDArray[np.float64], angles: NDArray[np.float64],
+        available: NDArray[np.float64],
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """Largest speeds (B,) [m/s] that can be had from a posture at rest (7,) in the times (B,) [s]."""
 
 
 @documented

@@ -157,8 +157,10 @@ class ShotSearch:
         """Strokes around some of a grid, with every share of the largest speed."""
         low, high = self.strikes.angle[0], self.strikes.angle[-1]
         angles = np.clip(grid.angle[rows][:, None] + self._around, low, high).ravel()
-        rows = np.repeat(rows, len(self._around))
-        largest = self.speeds(grid.puck[rows, :2], angles)
+        # Where time is short the speeds of the grid are less than the largest.
+        share = grid.speed[rows] / self.strikes.speeds(grid.puck[rows, :2], grid.angle[rows])
+        share, rows = np.repeat(share, len(self._around)), np.repeat(rows, len(self._around))
+        largest = share * self.speeds(grid.puck[rows, :2], angles)
         angle = np.tile(angles, len(self._shares))
         speed = np.outer(self._shares, largest).ravel()
         rows = np.tile(rows, len(self._shares))

@@ -20,8 +20,8 @@ _CHUNK = 50  # states that are weighed at once
 class TrainingConfig:
     """Options of training a policy.
 
-    Deviation: the thesis has 3000 states and 500 to 1000 epochs. More states in fewer epochs learn better here
-    in the same time: with 3000, angles of bank shots are too rough to keep the chance constraint.
+    Deviation: the thesis has 3000 states and 500 to 1000 epochs. More states in fewer epochs learn better
+    here in the same time: with 3000, angles of bank shots are too rough to keep the chance constraint.
     """
 
     states: int = option(10_000, "puck states N", minimum=1, maximum=10**6)
