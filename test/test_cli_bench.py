@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_bridge import bench, cli
-from sim_bridge.bench import belief_rows, library_rows, system_rows
+from sim_bridge.bench import belief_rows, hockey_rows, library_rows, system_rows
 from sim_bridge.bench.comparison import compare
 from sim_bridge.bench.growth import exponent, growth_tables, in_words
 from sim_bridge.bench.measuring import (
@@ -210,6 +210,11 @@ def test_growth_of_an_iteration_in_belief_space():
 def test_every_row_in_belief_space_works(row):
     (first, *_) = measure_once(row, 1, Effort(calls=1))
     assert first > 0.0
+
+
+@pytest.mark.parametrize("row", hockey_rows.ROWS, ids=lambda row: row.name)
+def test_every_row_of_air_hockey_works(row):
+    assert min(measure_once(row, 1, Effort(calls=3))) > 0.0
 
 
 def test_the_figures_wanted():
