@@ -49,7 +49,8 @@ def run(_arguments: argparse.Namespace | None = None) -> int:
     """
     began = time.perf_counter()
     pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
-    for use in (*pushing, predict_a_puck, plan_a_shot, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
+    hockey = predict_a_puck, plan_a_shot
+    for use in (*pushing, *hockey, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
     return 0

@@ -231,6 +231,10 @@ def test_the_figures_wanted():
         "belief_iteration_14dof_b30_p20_k50": ("p50_ms", 1.0),
         "robust_circle_plan": ("p50_ms", 500.0),
         "robust_circle_plan_rich": ("p50_ms", 1500.0),
+        "shot_planning_step": ("p99_ms", 3.0),
+        "shot_planning_step_policy": ("p99_ms", 3.0),
+        "shot_search_contact_time": ("p50_ms", 1.0),
+        "shooting_policy_step": ("p50_ms", 1.0),
         "mpc_step_push_box": ("p99_ms", 16.0),
         "driver": ("real_time_factor", 20.0),
     }

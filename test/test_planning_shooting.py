@@ -156,6 +156,37 @@ def test_a_later_time_has_its_price():
     assert times[1] < times[0]
 
 
+class PatientStrikes(StandInStrikes):
+    """Most of the speed is soon to be had, all of it takes longer."""
+
+    def timely_speeds(self, joints, puck, angles, available):
+        lead = self.lead(joints, puck, angles)
+        share = np.where(available >= lead + 0.6, 1.0, np.where(available >= lead, 0.75, 0.0))
+        return share * self.speeds(puck, angles)
+
+
+def test_speed_that_takes_time_is_worth_its_price_or_not():
+    """A direction that has been searched is searched again when the arm can be faster."""
+    for price, share in ((0.02, 1.0), (3.0, 0.75)):
+        agent = planner("aggressive", strikes=PatientStrikes(), delay_price=price, lower_speed=1.0)
+        shots = run(agent, course([-0.4, 0.1, 0.0, 0.0], 12))
+        shot = shots[-1]
+        largest = agent.search.speeds(shot.puck[None, :2], np.array([shot.angle]))[0]
+        assert shot.speed == pytest.approx(share * largest, rel=1e-6)
+        assert (shot.time > 1.2) == (share == 1.0)
+
+
+def test_a_refused_shot_is_not_chosen_again():
+    agent, states = planner(), course([-0.4, 0.1, 0.0, 0.0], 30)
+    run(agent, states[:6])
+    refused = agent.committed
+    agent.refuse()
+    assert agent.committed is None
+    shots = run(agent, states[:12], begin=0.14)
+    assert shots[-1] is not None
+    assert abs(shots[-1].time - refused.time) > 0.03 or abs(shots[-1].angle - refused.angle) > 0.15
+
+
 def test_searching_in_parts_finds_what_a_whole_round_finds():
     states = course([-0.55, 0.2, 0.1, -0.25], 30)
     whole, parts = planner(times_per_step=1000), planner(times_per_step=4)

@@ -46,8 +46,8 @@ def test_learn_command(tmp_path, capsys):
 
 def test_a_missing_model_is_a_message(tmp_path, capsys):
     for name, remedy in (("model", "vpsto learn puck_model"), ("strikes", "vpsto learn strikes")):
-        missing = ["learn", "shooting_policy", f"--{name}", str(tmp_path / "none"), "--out", str(tmp_path / "a")]
-        assert cli.main(missing) == 1
+        missing = [f"--{name}", str(tmp_path / "none"), "--out", str(tmp_path / "a")]
+        assert cli.main(["learn", "shooting_policy", *missing]) == 1
         assert remedy in capsys.readouterr().err
     arguments = ["--policies", str(tmp_path / "none.npz"), "--out", str(tmp_path / "out")]
     assert cli.main(["experiment", "shooting_policy", *arguments]) == 1
@@ -59,7 +59,7 @@ def test_a_comparison_judges_the_angle_of_the_policy(untrained):
     ratios = []
     for state in states(search, 12, 0.5, rng):
         found = compare(search, ShootingPolicy(untrained), state, CONFIG.covariance, rng)
-        assert found.inference_s.shape == (STEPS,) and (found.inference_s > 0.0).all() and found.direct_s > 0.0
+        assert found.inference_s.shape == (STEPS,) and (found.inference_s > 0.0).all()
         assert found.direct is not None and found.direct.goal > 0.5
         if found.policy is None or found.policy.goal <= 0.5:
             assert found.ratio == 0.0
