@@ -43,7 +43,7 @@ def write(
         shots = _shots(row[0], searches[setting], policy, setting)
         _landscapes(row[1:], policy)
     if shots is not None:
-        figure.colorbar(shots, ax=panels[:, 0].tolist(), label="speed of the mallet [m/s]", shrink=0.5)
+        figure.colorbar(shots, ax=panels[:, 0].tolist(), label="speed of the mallet [m/s]", location="bottom")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
