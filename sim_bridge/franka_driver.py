@@ -17,7 +17,6 @@ from concurrent.futures import TimeoutError as FutureTimeout
 from typing import Any
 
 import numpy as np
-import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
 from nav_msgs.msg import Odometry
@@ -36,6 +35,7 @@ from sim_bridge.impedance import ImpedanceConfig
 from sim_bridge.pacing import Pacer, Ticker
 from sim_bridge.scene import Scene
 from sim_bridge.simulation import Simulation
+from sim_bridge.spinning import Spinning
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryCommand, TrajectoryRejected
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
@@ -49,6 +49,7 @@ from vpsto_ros.nodes.diagnostics import ERROR, OK, Diagnostics, Pulse
 from vpsto_ros.nodes.joint_conversions import read_trajectory
 from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
 from vpsto_ros.nodes.scene import ShapeConfig
+from vpsto_ros.nodes.stop_signals import StopSignals
 
 SLICE = 0.005
 """Simulated time between two looks at the queue [s]."""
@@ -152,25 +153,19 @@ class FrankaDriver(ManagedNode):
         """The present simulated time as a message."""
         return SIMULATED.stamp(self.simulation.time)
 
-    def spin(self, executor: Executor) -> None:
+    def spin(self, executor: Executor, signals: StopSignals) -> None:
         """Step the simulation while another thread executes callbacks."""
         # A callback in Python may hold the interpreter for this long; the default is the length of a slice.
         sys.setswitchinterval(1e-3)
-        failures: list[BaseException] = []
-        thread = threading.Thread(target=_spin_until_shutdown, args=(executor, failures), daemon=True)
-        thread.start()
-        try:
-            self._run(thread)
-        finally:
-            executor.shutdown(timeout_sec=2.0)
-            thread.join(timeout=2.0)
-        if failures:
-            raise failures[0]
+        with Spinning(executor) as callbacks:
+            self._run(callbacks, signals)
+        if callbacks.failure is not None:
+            raise callbacks.failure
 
-    def _run(self, callbacks: threading.Thread) -> None:
+    def _run(self, callbacks: Spinning, signals: StopSignals) -> None:
         """Advance whenever the node is active, for as long as callbacks are executed."""
         running = False
-        while rclpy.ok() and callbacks.is_alive():
+        while not signals.requested and callbacks.alive:
             if not (self.active and self.configured):
                 running = False
                 time.sleep(0.02)
@@ -365,13 +360,6 @@ class FrankaDriver(ManagedNode):
         wall, simulated = self._measured
         self._measured = (time.perf_counter(), self.simulation.time)
         return (self._measured[1] - simulated) / max(self._measured[0] - wall, 1e-9)
-
-
-def _spin_until_shutdown(executor: Executor, failures: list[BaseException]) -> None:
-    try:
-        executor.spin()
-    except BaseException as error:  # handed to the main thread, which raises it
-        failures.append(error)
 
 
 def _compile(config: FrankaDriverConfig) -> None:
