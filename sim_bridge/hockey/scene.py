@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from sim_bridge.arm_world import TIMESTEP
 from sim_bridge.hockey import table as t
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.robot.iiwa import JOINT_NAMES, MODEL_PATH
 
-TIMESTEP = 0.001
 START_JOINTS = (0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0)  # [rad]; the mallet is then at (0.65, 0)
 SURFACES = ("left", "right", "near", "far")
 """The rims: left (+y), right (-y), near (the robot's end) and far."""
