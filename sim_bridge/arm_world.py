@@ -35,12 +35,14 @@ class ArmWorld(abc.ABC):
         controller: the arm's controller.
         camera: the camera.
         limits: counts what breaks the arm's limits.
+        surface: height of the table, on which the object lies, above the base [m].
     """
 
     scene: Any
     follower: TrajectoryFollower
     controller: JointController
     camera: Camera
+    surface = 0.0
 
     def __init__(self, model: mujoco.MjModel, robot: Robot) -> None:
         """Take views into MuJoCo's state, once: they stay valid as long as the data lives."""

@@ -54,7 +54,7 @@ def test_each_rule_is_counted_beyond_its_bound_and_only_there(kind, name, index,
 def test_the_worst_values_are_those_nearest_to_breaking_a_rule():
     monitor, rng = RulesMonitor(LIMITS), np.random.default_rng(1)
     assert all(np.isnan(getattr(monitor.report(), kind).worst) for kind in KINDS)
-    noise = [{name: 0.1 * rng.standard_normal(len(value)) for name, value in LEGAL.items()} for _ in range(50)]
+    noise = [{name: 0.1 * rng.standard_normal(len(LEGAL[name])) for name in LEGAL} for _ in range(50)]
     seen = [{name: value + each[name] for name, value in LEGAL.items()} for each in noise]
     for each in seen:
         monitor.observe(**each)

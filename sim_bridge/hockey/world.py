@@ -73,6 +73,8 @@ class AirHockeyWorld(ArmWorld):
         goal: where the puck went out of play, or None; stays until the puck is put back.
     """
 
+    surface = table.TABLE_ORIGIN[2]
+
     def __init__(
         self,
         scene: AirHockeyScene | None = None,
