@@ -127,7 +127,10 @@ EXPERIMENTS = {
 }
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),
+    "strikes": Choice("sim_bridge.learn.strikes", "in which posture the iiwa strikes a puck fastest"),
 }
+
+LEARNED_FILES = {"puck_model": ".json", "strikes": ".npz"}
 
 
 def positive(text: str) -> float:
@@ -203,8 +206,10 @@ def build_parser(chosen: Sequence[str] = ()) -> argparse.ArgumentParser:
     experiments = _add_modules(experiment, "EXPERIMENT", EXPERIMENTS, _experiment_arguments)
     if list(chosen[:1]) == ["experiment"] and chosen[1:2] and chosen[1] in EXPERIMENTS:
         _load(EXPERIMENTS[chosen[1]].module).add_arguments(experiments[chosen[1]])
-    learn = commands.add_parser("learn", help="learn a model from recorded episodes and write it to a file")
-    _add_modules(learn, "MODEL", LEARNERS, _learn_arguments)
+    learn = commands.add_parser("learn", help="learn or tabulate a model and write it to a file")
+    learners = _add_modules(learn, "MODEL", LEARNERS, _learn_arguments)
+    if list(chosen[:1]) == ["learn"] and chosen[1:2] and chosen[1] in LEARNERS:
+        _load(LEARNERS[chosen[1]].module).add_arguments(learners[chosen[1]])
     bench = commands.add_parser("bench", help="measure the time of each building block on this machine")
     bench.add_argument("--json", metavar="FILE", help="also write the rows to this file")
     bench.add_argument("--only", metavar="NAME", help="measure only the rows whose name contains this")
@@ -286,13 +291,8 @@ def _experiment_arguments(parser: argparse.ArgumentParser, name: str) -> None:
 
 
 def _learn_arguments(parser: argparse.ArgumentParser, name: str) -> None:
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = f"example: vpsto learn {name} --episodes 400 --seed 1 --out {name}.json"
-    parser.add_argument(
-        "--episodes", type=count, default=100, metavar="N", help="to record, a second each (default 100)"
-    )
-    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of the episodes (default 0)")
-    out = f"output/{name}.json"
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="of all that is random (default 0)")
+    out = f"output/{name}{LEARNED_FILES[name]}"
     parser.add_argument(
         "--out", default=out, metavar="FILE", type=file, help=f"where to write the model (default {out})"
     )

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from tqdm import tqdm
 
+from sim_bridge.cli import count
 from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import CONTACT_TIME, TABLE, Recorder, kind_of
 from vpsto_ros.contact.puck import MODES, PuckModel
@@ -14,6 +15,15 @@ from vpsto_ros.contact.puck_learning import LabelledSteps, collect, fit, widened
 ENOUGH = 20
 """Steps of each mode, below which its scatter is a guess."""
 _STREAM = 1  # its episodes are not those of any experiment, whatever the seed
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = "example: vpsto learn puck_model --episodes 400 --seed 1 --out puck_model.json"
+    parser.add_argument(
+        "--episodes", type=count, default=100, metavar="N", help="to record, a second each (default 100)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,0 +1,339 @@
+"""Strikes, tabulated: in which posture the mallet is fastest at a place, in a direction (5.13).
+
+The thesis asks for the largest speed in a given shooting posture. Which posture decides it: one that inverse
+kinematics finds near the start of the arm reaches little more than half of what the redundant joints can.
+They are searched once, offline, for a grid of puck positions and shooting angles; online a posture is looked
+up and moved to the exact place.
+"""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.strike_search import search_posture
+from vpsto_ros.robot.iiwa import iiwa14
+from vpsto_ros.robot.iiwa_kinematics import add_least_motion, move_to
+
+FORMAT = "vpsto_ros strikes 1"
+SHIPPED = pathlib.Path(__file__).parent / "models" / "strikes.npz"
+"""The table of the iiwa at the air-hockey table, which comes with the package; its origin is in the file."""
+_MIRROR = np.array([-1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])  # of the joints, across the plane y = 0
+_LEAST_SPEED = 0.2  # slower strikes are none [m/s]
+_LARGEST_BREACH = 0.05  # what the search may leave of breaches [m/s]; planned motions are checked themselves
+
+
+@documented
+@dataclasses.dataclass(frozen=True)
+class StrikeConfig:
+    """How a strike runs.
+
+    Raises:
+        ConfigurationError: a value is out of range; the message names what is allowed.
+    """
+
+    run_up: float = option(
+        0.2, "time in which the joints accelerate before the touch", unit="s", minimum=0.11, maximum=1.0
+    )
+    hold: float = option(
+        0.045, "time for which they keep their speed after it: a contact lasts 18 ms", unit="s", minimum=0.0,
+        maximum=0.5,
+    )  # fmt: skip
+    brake: float = option(0.15, "time in which they come to rest", unit="s", minimum=0.11, maximum=1.0)
+    lead_weight: float = option(
+        0.15, "price of a posture far from home, per second that its quickest joint motion takes",
+        unit="m/s²", minimum=0.0, maximum=10.0,
+    )  # fmt: skip
+    speed_share: float = option(
+        0.97, "share of the planned velocity limits in a strike: what replanning needs", minimum=0.1,
+        maximum=1.0,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StrikeTable:
+    """Postures at the touch over a grid of puck positions (table frame) and shooting angles.
+
+    Attributes:
+        x, y: uniform grids of the puck's centre at the touch, table frame [m].
+        angle: uniform grid of the direction of the mallet's motion, from +x [rad].
+        speed: largest speed of the mallet, shape (X, Y, A) [m/s]; 0 where there is no strike.
+        posture: joint positions at the touch with the universal joint above the mallet, (X, Y, A, 7) [rad].
+        rates: joint velocities there at that speed, (X, Y, A, 7) [rad/s].
+        config: how strikes run.
+        rules: what they keep.
+
+    Raises:
+        InvalidInputError: the shapes do not fit, a grid is not uniform, or a number is not finite.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    angle: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    posture: NDArray[np.float64]
+    rates: NDArray[np.float64]
+    config: StrikeConfig = dataclasses.field(default_factory=StrikeConfig)
+    rules: PlayRules = dataclasses.field(default_factory=PlayRules)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.x), len(self.y), len(self.angle))
+        for name in ("x", "y", "angle", "speed", "posture", "rates"):
+            array = np.ascontiguousarray(getattr(self, name), dtype=float)
+            expected = {"x": shape[:1], "y": shape[1:2], "angle": shape[2:], "speed": shape}.get(
+                name, (*shape, 7)
+            )
+            if array.shape != expected or not np.isfinite(array).all():
+                raise InvalidInputError(f"strikes: {name} must be finite, {expected}, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for grid in self.grids:
+            if len(grid) < 2 or not np.allclose(np.diff(grid), grid[1] - grid[0]) or grid[1] <= grid[0]:
+                raise InvalidInputError("strikes: grids must be uniform, increasing, of two values at least")
+        if (self.speed < 0.0).any():
+            raise InvalidInputError("strikes: speeds must not be negative")
+
+    @property
+    def grids(self) -> tuple[NDArray, NDArray, NDArray]:
+        """x, y and angle."""
+        return self.x, self.y, self.angle
+
+    def speeds(self, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
+        """Largest mallet speeds (B,) [m/s] for pucks (B, 2) and angles (B,); 0 where there is no strike.
+
+        Trilinear between the entries of the table; 0 outside of it and next to an entry without a strike.
+        """
+        where = np.column_stack([np.asarray(puck, dtype=float), np.asarray(angles, dtype=float)])
+        found = np.empty(len(where))
+        low = np.array([grid[0] for grid in self.grids])
+        step = np.array([grid[1] - grid[0] for grid in self.grids])
+        _interpolate(self.speed, low, step, np.ascontiguousarray(where), found)
+        return found
+
+    def cell(self, puck: ArrayLike, angle: float) -> tuple[int, int, int] | None:
+        """The entry nearest to a puck (2,) and an angle, None without a strike or outside of the table."""
+        index = []
+        for grid, value in zip(self.grids, (*np.asarray(puck, dtype=float), angle), strict=True):
+            step = grid[1] - grid[0]
+            if not grid[0] - 0.5 * step <= value <= grid[-1] + 0.5 * step:
+                return None
+            index.append(min(max(round((value - grid[0]) / step), 0), len(grid) - 1))
+        found = (index[0], index[1], index[2])
+        return found if self.speed[found] > 0.0 else None
+
+    def contact(
+        self, cell: tuple[int, int, int], place: ArrayLike, velocity: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """The posture of an entry moved to where the universal joint is to be, with its velocity.
+
+        Args:
+            cell: entry.
+            place: of the universal joint, base frame, shape (2,) [m].
+            velocity: of it, shape (2,) [m/s].
+
+        Returns:
+            Joint positions and velocities (7,), each as near to those of the entry as possible; None where
+            the place is out of reach.
+        """
+        q, qd = self.posture[cell].copy(), self.rates[cell].copy()
+        vx, vy = np.asarray(velocity, dtype=float).tolist()
+        x, y = np.asarray(place, dtype=float).tolist()
+        share = np.hypot(vx, vy) / self.speed[cell]
+        qd *= share
+        return (q, qd) if _settle(q, qd, x, y, self.rules.height, vx, vy) else None
+
+    def start(self, cell: tuple[int, int, int]) -> NDArray[np.float64]:
+        """About where the run-up of an entry begins at rest, joint positions (7,) [rad]."""
+        return self.posture[cell] - 0.5 * self.config.run_up * self.rates[cell]
+
+    def lead(self, joints: ArrayLike, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
+        """Least times (B,) [s] from joints (7,) at rest to the touch of pucks (B, 2) at angles (B,).
+
+        The joints go to the start of the run-up on a cubic, and from there into the strike; inf without one.
+        """
+        limits = self.rules.limits(iiwa14())
+        where = np.column_stack([np.asarray(puck, dtype=float), np.asarray(angles, dtype=float)])
+        low = np.array([grid[0] for grid in self.grids])
+        step = np.array([grid[1] - grid[0] for grid in self.grids])
+        index = np.clip(np.rint((where - low) / step).astype(int), 0, np.array(self.speed.shape) - 1)
+        entries = tuple(index.T)
+        begin = self.posture[entries] - 0.5 * self.config.run_up * self.rates[entries]
+        way = np.abs(begin - np.asarray(joints, dtype=float))
+        times = np.maximum(1.5 * way / limits.velocity, np.sqrt(6.0 * way / limits.acceleration))
+        return np.where(self.speeds(puck, angles) > 0.0, times.max(axis=1) + self.config.run_up, np.inf)
+
+    def save(self, path: str | pathlib.Path, **origin: Any) -> None:
+        """Write a file.
+
+        Args:
+            path: of the file, which ends in .npz.
+            origin: where the table comes from (command, seed, figures), for people.
+        """
+        about = {
+            "format": FORMAT, "origin": origin, "config": dataclasses.asdict(self.config),
+            "rules": dataclasses.asdict(self.rules),
+        }  # fmt: skip
+        np.savez_compressed(
+            path, about=np.array(json.dumps(about)), x=self.x, y=self.y, angle=self.angle, speed=self.speed,
+            posture=self.posture.astype(np.float32), rates=self.rates.astype(np.float32),
+        )  # fmt: skip
+
+    @classmethod
+    def load(cls, path: str | pathlib.Path = SHIPPED) -> "StrikeTable":
+        """Read a file that :meth:`save` wrote.
+
+        Raises:
+            ConfigurationError: there is no such file, it is of another format, or its numbers are no table.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as content:
+                about = json.loads(str(content["about"]))
+                arrays = {name: content[name] for name in ("x", "y", "angle", "speed", "posture", "rates")}
+        except FileNotFoundError:
+            raise ConfigurationError(
+                f"there is no table of strikes {path}; `vpsto learn strikes` makes one"
+            ) from None
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise ConfigurationError(f"{path} is not a table of strikes: {error}") from None
+        if not isinstance(about, dict) or about.get("format") != FORMAT:
+            raise ConfigurationError(f"{path} is not of the format '{FORMAT}'")
+        try:
+            rules = {**about["rules"], "home": tuple(about["rules"]["home"])}
+            return cls(**arrays, config=StrikeConfig(**about["config"]), rules=PlayRules(**rules))
+        except (KeyError, TypeError, InvalidInputError, ConfigurationError) as error:
+            raise ConfigurationError(f"{path} is not a table of strikes: {error}") from None
+
+
+def tabulate(
+    x: ArrayLike,
+    y: ArrayLike,
+    angle: ArrayLike,
+    contact_distance: float,
+    rng: np.random.Generator,
+    *,
+    config: StrikeConfig | None = None,
+    rules: PlayRules | None = None,
+    effort: int = 4000,
+    progress: Any = iter,
+) -> StrikeTable:
+    """Search the postures of a grid; grids must be symmetric in y and angle, as the arm is.
+
+    Args:
+        x: grid, see :class:`StrikeTable`.
+        y: likewise.
+        angle: likewise.
+        contact_distance: between the centres of puck and mallet when they touch [m].
+        rng: source of randomness.
+        config: how strikes run.
+        rules: what they keep.
+        effort: postures that are tried per entry.
+        progress: wraps the entries to be searched, such as tqdm.
+    """
+    config, rules = config or StrikeConfig(), rules or PlayRules()
+    x, y, angle = (np.asarray(grid, dtype=float) for grid in (x, y, angle))
+    if not (np.allclose(y, -y[::-1]) and np.allclose(angle, -angle[::-1])):
+        raise InvalidInputError("strikes: the grids of y and angle must be symmetric about 0")
+    search = _Search(config, rules, contact_distance, effort, rng)
+    shape = (len(x), len(y), len(angle))
+    speed, posture, rates = np.zeros(shape), np.zeros((*shape, 7)), np.zeros((*shape, 7))
+    half = [(i, j, k) for i in range(shape[0]) for j in range(len(y) // 2, shape[1]) for k in range(shape[2])]
+    # The second round starts from the neighbours' postures as well: better, and smoother over the table.
+    entries: Iterable[tuple[int, tuple[int, int, int]]] = [(n, index) for n in range(2) for index in half]
+    for again, (i, j, k) in progress(entries):
+        near = _neighbours(posture, speed, (i, j, k)) if again else np.zeros((0, 7))
+        found = search(np.array([x[i], y[j]]), angle[k], near)
+        if found[0] < speed[i, j, k]:
+            continue
+        twin = (i, len(y) - 1 - j, len(angle) - 1 - k)
+        speed[i, j, k], posture[i, j, k], rates[i, j, k] = found
+        speed[twin], posture[twin], rates[twin] = found[0], _MIRROR * found[1], _MIRROR * found[2]
+    return StrikeTable(x, y, angle, speed, posture, rates, config, rules)
+
+
+class _Search:
+    """The search for one entry."""
+
+    def __init__(
+        self, config: StrikeConfig, rules: PlayRules, distance: float, effort: int, rng: np.random.Generator
+    ) -> None:
+        limits, self._rules, self._distance = rules.limits(iiwa14()), rules, distance
+        self._home = np.array(rules.home)
+        self._velocity, self._positions = config.speed_share * limits.velocity, 0.99 * limits.upper
+        self._row = np.array(
+            [*rules.kernel_row(), config.run_up, config.hold, config.brake, config.lead_weight]
+        )
+        # A strike as it is searched is nearer to the plane than what is allowed: replanning needs the rest.
+        self._row[1] *= 0.4
+        spread = np.array([0.5, 0.6, 0.8, 0.5, 0.8, 0.6, 0.0])
+        self._seeds = self._home + spread * rng.standard_normal((effort // 5, 7))
+        self._noise = rng.standard_normal((effort - effort // 5, 7))
+        self._noise[:, 6] = 0.0  # it turns the rod about itself
+
+    def __call__(self, puck: NDArray, angle: float, near: NDArray) -> tuple[float, NDArray, NDArray]:
+        """Speed, posture and rates for a puck (2,), table frame; postures (S, 7) are tried first."""
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        place = puck + self._rules.table - self._distance * direction
+        posture, rates = np.zeros(7), np.zeros(7)
+        speed, breaches = search_posture(
+            place[0], place[1], angle, self._velocity, self._positions, self._row, self._home,
+            np.vstack([near, self._seeds]), self._noise, 8, posture, rates,
+        )  # fmt: skip
+        return (speed if breaches < _LARGEST_BREACH and speed > _LEAST_SPEED else 0.0), posture, rates
+
+
+def _neighbours(posture: NDArray, speed: NDArray, index: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Postures (S, 7) of an entry and of those next to it that have a strike."""
+    block = tuple(slice(max(i - 1, 0), i + 2) for i in index)
+    return posture[block][speed[block] > 0.0]
+
+
+@njit(cache=True, nogil=True)
+def _settle(q, qd, x, y, z, vx, vy):
+    """Move joint positions and velocities (7,) by the least to where the universal joint is to be."""
+    points, axes, jac = np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6))
+    if not move_to(q, x, y, z, points, axes, jac):
+        return False
+    ex, ey, ez = vx, vy, 0.0
+    for k in range(6):
+        ex, ey, ez = ex - jac[0, k] * qd[k], ey - jac[1, k] * qd[k], ez - jac[2, k] * qd[k]
+    add_least_motion(jac, ex, ey, ez, qd)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(values, low, step, where, found):
+    """Trilinear interpolation of values (X, Y, A) at points (B, 3); 0 outside and next to a 0."""
+    for b in range(len(where)):
+        found[b] = 0.0
+        i0, parts, inside = np.zeros(3, dtype=np.int64), np.zeros(3), True
+        for d in range(3):
+            at = (where[b, d] - low[d]) / step[d]
+            if not -1e-9 <= at <= values.shape[d] - 1 + 1e-9:
+                inside = False
+                break
+            i0[d] = min(max(int(at), 0), values.shape[d] - 2)
+            parts[d] = min(max(at - i0[d], 0.0), 1.0)
+        if not inside:
+            continue
+        total = 0.0
+        for corner in range(8):
+            weight, i, j, k = 1.0, i0[0], i0[1], i0[2]
+            for d in range(3):
+                weight *= parts[d] if corner >> d & 1 else 1.0 - parts[d]
+            i, j, k = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2 & 1)
+            if weight > 1e-9 and values[i, j, k] == 0.0:
+                total = 0.0
+                break
+            total += weight * values[i, j, k]
+        found[b] = total
