@@ -1,0 +1,230 @@
+"""Direct search of (5.12) over the reduced action of 5.3.2: angle and speed of the mallet at the touch."""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.contact.puck import PuckModel, ShotOutlook, contact_frames
+from vpsto_ros.planning.shooting_config import ShootingConfig, Shot, Strikes
+
+_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])  # turns by a quarter
+_LEAST_CLOSING = 0.05  # slower mallets hardly touch [m/s]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Strokes:
+    """B ways to touch the puck.
+
+    Attributes:
+        time: of the touch, shape (B,) [s].
+        puck: states just before it, shape (B, 4).
+        covariance: of these, shape (B, 4, 4).
+        angle: of the mallet's velocity, shape (B,) [rad].
+        speed: of the mallet, shape (B,) [m/s].
+    """
+
+    time: NDArray[np.float64]
+    puck: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    angle: NDArray[np.float64]
+    speed: NDArray[np.float64]
+
+    def with_angles(self, rows: NDArray, angle: NDArray, speed: NDArray) -> "Strokes":
+        """At the same times as some rows, in other ways."""
+        return Strokes(self.time[rows], self.puck[rows], self.covariance[rows], angle, speed)
+
+
+class ShotSearch:
+    """Weighs shots by the stochastic model of the puck, and finds the best at a contact time.
+
+    Attributes:
+        model: of the puck.
+        strikes: what the arm can do.
+        config: options.
+        angles: the grid that is searched, shape (A,) [rad].
+    """
+
+    def __init__(self, model: PuckModel, strikes: Strikes, config: ShootingConfig) -> None:
+        """Lay out the grid."""
+        self.model, self.strikes, self.config = model, strikes, config
+        self.angles = np.linspace(strikes.angle[0], strikes.angle[-1], config.angles)
+        self._distance = model.table.contact_distance
+        spacing = self.angles[1] - self.angles[0]
+        self._around = spacing * np.linspace(-1.0, 1.0, config.refinements + 2)[1:-1]
+        self._shares = np.unique([1.0, config.lower_speed])[::-1]
+        table = model.table
+        self._mallet_reach = np.array([table.half_length, table.half_width]) - table.mallet_radius
+
+    def speeds(self, puck: NDArray, angles: NDArray) -> NDArray[np.float64]:
+        """Largest speeds (B,) at places (B, 2); 0 where the arm cannot strike or the mallet has no room."""
+        return np.where(self.fits(puck, angles), self.strikes.speeds(puck, angles), 0.0)
+
+    def fits(self, puck: NDArray, angles: NDArray) -> NDArray[np.bool_]:
+        """Whether there is room (B,) for the mallet behind the puck, and on its way there."""
+        direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        behind = puck - (self._distance + self.config.run_up) * direction
+        touching = puck - self._distance * direction
+        farthest = np.maximum(np.abs(behind), np.abs(touching))
+        inside: NDArray[np.bool_] = np.all(farthest <= self._mallet_reach - self.config.room, axis=-1)
+        return inside
+
+    def outlook(self, strokes: Strokes) -> ShotOutlook:
+        """What is expected of B strokes, with the errors of puck and mallet."""
+        mean, covariance = after_hit(self.model, strokes, self.config.aim_std, self.config.speed_std)
+        return self.model.outlook(mean, covariance)
+
+    def shot(self, strokes: Strokes, outlook: ShotOutlook, row: int) -> Shot:
+        """One of them."""
+        return Shot(
+            float(strokes.time[row]), strokes.puck[row].copy(), float(strokes.angle[row]),
+            float(strokes.speed[row]), float(outlook.goal[row]), float(outlook.speed[row]),
+            int(outlook.banks[row]), float(self.config.objective.values(outlook)[row]), self._distance,
+        )  # fmt: skip
+
+    def ranked(self, time: NDArray, outlook: ShotOutlook) -> NDArray[np.float64]:
+        """Scores (B,) less the price of touches at later times (B,)."""
+        return self.config.objective.scores(outlook) - self.config.delay_price * time
+
+    def taken(self, shot: Shot) -> bool:
+        """Whether a shot may be chosen: it keeps the constraints, or is a fallback that reaches the goal."""
+        objective = self.config.objective
+        if not np.isfinite(shot.goal_speed):
+            return False
+        return (shot.goal > objective.beta and shot.banks >= objective.least_banks) or self.config.fallback
+
+    def best(self, time: float, puck: NDArray, covariance: NDArray) -> Shot | None:
+        """The best shot at a contact time; the likeliest if none keeps the constraints, None if none exists.
+
+        Args:
+            time: of the touch [s].
+            puck: expected state then, shape (4,).
+            covariance: of it, shape (4, 4).
+        """
+        places = np.repeat(puck[None, :2], len(self.angles), axis=0)
+        return self.best_of(
+            np.array([time]), puck[None], covariance[None], self.speeds(places, self.angles)[None]
+        )
+
+    def best_of(
+        self, times: NDArray, pucks: NDArray, covariances: NDArray, speeds: NDArray
+    ) -> Shot | None:
+        """The best shot at some contact times, None if no mallet speed is given.
+
+        Args:
+            times: of the touch, shape (K,) [s].
+            pucks: expected states then, shape (K, 4).
+            covariances: of these, shape (K, 4, 4).
+            speeds: of the mallet on the grid of angles, shape (K, A) [m/s]; 0 for what is not searched.
+        """
+        slot, column = np.nonzero(speeds)
+        if not slot.size:
+            return None
+        grid = Strokes(
+            times[slot], pucks[slot], covariances[slot], self.angles[column], speeds[slot, column]
+        )
+        outlook = self.outlook(grid)
+        ranks = np.full(speeds.shape, -np.inf)
+        ranks[slot, column] = self.ranked(grid.time, outlook)
+        row = np.full(speeds.shape, -1)
+        row[slot, column] = np.arange(len(slot))
+        fine = self._refined(grid, row[_peaks(ranks, self.config.peaks)])
+        chances = self.outlook(fine)
+        finest = self.ranked(fine.time, chances)
+        first, second = int(np.argmax(ranks[slot, column])), int(np.argmax(finest)) if finest.size else -1
+        if second >= 0 and finest[second] > ranks[slot, column][first]:
+            return self.shot(fine, chances, second)
+        return self.shot(grid, outlook, first)
+
+    def _refined(self, grid: Strokes, rows: NDArray) -> Strokes:
+        """Strokes around some of a grid, with every share of the largest speed."""
+        low, high = self.strikes.angle[0], self.strikes.angle[-1]
+        angles = np.clip(grid.angle[rows][:, None] + self._around, low, high).ravel()
+        rows = np.repeat(rows, len(self._around))
+        largest = self.speeds(grid.puck[rows, :2], angles)
+        angle = np.tile(angles, len(self._shares))
+        speed = np.outer(self._shares, largest).ravel()
+        rows = np.tile(rows, len(self._shares))
+        there = speed > _LEAST_CLOSING
+        return grid.with_angles(rows[there], angle[there], speed[there])
+
+
+def _peaks(ranks: NDArray, count: int) -> tuple[NDArray, NDArray]:
+    """Where (K, A) ranks are highest among their neighbours in a row: the best few."""
+    padded = np.pad(ranks, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peak = np.isfinite(ranks) & (ranks >= padded[:, :-2]) & (ranks > padded[:, 2:])
+    slot, column = np.nonzero(peak)
+    chosen = np.argsort(-ranks[slot, column], kind="stable")[:count]
+    return slot[chosen], column[chosen]
+
+
+def after_hit(
+    model: PuckModel, strokes: Strokes, aim_std: float, speed_std: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gaussians of the puck after hits, with what is not known before them, to first order.
+
+    Deviation: the thesis begins with Q_3 alone. Here the state of the puck is uncertain, too, and the mallet
+    is off its place. What shifts them against each other across the motion turns the normal of the contact, by
+    the shift over the distance of their centres; what does so along the motion changes the time of the touch,
+    and with it the place of a puck that moves sideways.
+
+    Args:
+        model: of the puck.
+        strokes: B of them.
+        aim_std: standard deviation of the mallet's place across its motion [m].
+        speed_std: of its speed along it [m/s].
+
+    Returns:
+        mean (B, 4) and covariance (B, 4, 4).
+    """
+    normal = np.stack([np.cos(strokes.angle), np.sin(strokes.angle)], axis=-1)
+    distance, puck = model.table.contact_distance, strokes.puck
+    mallet = np.hstack([puck[:, :2] - distance * normal, strokes.speed[:, None] * normal])
+    mean, covariance = model.hit(puck, mallet)
+    frames = contact_frames(normal)
+    turned = frames.transpose(0, 2, 1)
+    theta_puck, theta_mallet = model.mallet.matrix[:, :2], model.mallet.matrix[:, 2:]
+    before, pushed = _times(turned, puck[:, 2:]), _times(turned, mallet[:, 2:])
+    after = before @ theta_puck.T + pushed @ theta_mallet.T + model.mallet.offset
+    # d/dphi of F f(F' v_puck, F' v_mallet), with dF = F S.
+    quarter = _QUARTER.T
+    change = after @ quarter - before @ quarter @ theta_puck.T - pushed @ quarter @ theta_mallet.T
+    turn = _times(frames, change) / distance
+    relative = before - pushed
+    sideways = relative[:, 1] / np.maximum(-relative[:, 0], _LEAST_CLOSING)
+    shift = frames[:, :, 1] + sideways[:, None] * frames[:, :, 0]
+    velocity = np.concatenate(
+        [turn[:, :, None] * shift[:, None, :], frames @ theta_puck @ turned], axis=2
+    )  # of the state before, (B, 2, 4)
+    jacobian = _with_delay(velocity, model.hit_delay)
+    jacobian[:, :2, :2] += np.eye(2)
+    jacobian[:, :2, 2:] += model.hit_delay * np.eye(2)
+    errors = np.stack([aim_std * turn, speed_std * (frames @ theta_mallet[:, 0])], axis=2)
+    errors = _with_delay(errors, model.hit_delay)
+    covariance += jacobian @ strokes.covariance @ jacobian.transpose(0, 2, 1)
+    covariance += errors @ errors.transpose(0, 2, 1)
+    return mean, covariance
+
+
+def _with_delay(velocity: NDArray, delay: float) -> NDArray[np.float64]:
+    """Changes (B, 4, n) of the state from those (B, 2, n) of the velocity that comes late."""
+    return np.concatenate([-delay * velocity, velocity], axis=1)
+
+
+def _times(matrices: NDArray, vectors: NDArray) -> NDArray[np.float64]:
+    return np.einsum("bij,bj->bi", matrices, vectors)
+
+
+def predict(
+    model: PuckModel, mean: NDArray, covariance: NDArray, times: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Gaussian states (K, 4), (K, 4, 4) of the free puck at rising times (K,) from now [s], through walls."""
+    means, covariances = np.empty((len(times), 4)), np.empty((len(times), 4, 4))
+    passed = 0.0
+    for k, time in enumerate(times):
+        while time - passed > 1e-9:
+            duration = min(model.period, time - passed)
+            mean, covariance = model.step(mean, covariance, duration)
+            passed += duration
+        means[k], covariances[k] = mean, covariance
+    return means, covariances
