@@ -55,7 +55,10 @@ class JointController:
             limits, shape (2, n).
     """
 
-    def __init__(self, robot: Robot, stiffness: ArrayLike, damping: ArrayLike, *, period: float = 0.001):
+    def __init__(
+        self, robot: Robot, stiffness: ArrayLike, damping: ArrayLike, *, period: float = 0.001,
+        implicit: bool = False,
+    ):  # fmt: skip
         """Take the gains.
 
         Args:
@@ -63,6 +66,9 @@ class JointController:
             stiffness: joint stiffness [Nm/rad], shape (n,).
             damping: damping matrix [Nm s/rad], shape (n, n).
             period: control period [s].
+            implicit: whether springs and dampers act on what position and velocity will be at the end of the
+                cycle, as in drives that close their loops many times per cycle. Stiff dampers on light joints
+                are unstable otherwise: D period must stay below 2 M.
 
         Raises:
             InvalidInputError: the period is not positive, or a gain has another shape.
@@ -70,7 +76,7 @@ class JointController:
         if not period > 0.0:
             raise InvalidInputError(f"period must be positive, got {period}")
         n = robot.dof
-        self._robot = robot
+        self._robot, self._period, self._implicit = robot, period, implicit
         self._stiffness = np.array(stiffness, dtype=float)
         self._damping = np.array(damping, dtype=float)
         if self._stiffness.shape != (n,) or self._damping.shape != (n, n):
@@ -111,6 +117,9 @@ class JointController:
             qd_des: desired velocities [rad/s], shape (n,).
             qdd_des: desired accelerations [rad/s²], shape (n,).
         """
+        if self._implicit:
+            qdd_des = qdd_des + self._return_acceleration(q, q - q_des, qd - qd_des)
+            q_des, qd_des = q, qd
         model_torque = self._robot.inverse_dynamics(q, qd, qdd_des)
         _control_law(
             model_torque, q, qd, q_des, qd_des, self._stiffness, self._damping, self._limit, self._step,
@@ -118,6 +127,15 @@ class JointController:
         )  # fmt: skip
         self._fresh = False
         return self._torque
+
+    def _return_acceleration(self, q: NDArray, e: NDArray, ed: NDArray) -> NDArray[np.float64]:
+        """What springs and dampers do to errors e and ed if they act on the ones at the end of the cycle.
+
+        With those, e + h ed + h² a and ed + h a, M a = -K (e + h ed + h² a) - D (ed + h a).
+        """
+        h, mass = self._period, self._robot.mass_matrix(q)
+        total = mass + h * self._damping + np.diag(h * h * self._stiffness)
+        return np.linalg.solve(total, -self._stiffness * (e + h * ed) - self._damping @ ed)
 
 
 class ImpedanceController(JointController):

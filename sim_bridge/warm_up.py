@@ -93,7 +93,10 @@ def predict_a_puck() -> None:
     """The learned model of an air-hockey puck, and its filter."""
     model, start, spread = PuckModel.load(SHIPPED), np.array([0.0, 0.4, 1.0, 1.5]), 1e-6 * np.eye(4)
     model.step(start, spread)
+    model.predict(start, spread, np.array([0.1, 0.9]))
     model.outlook(start[None], spread[None])
+    model.shots(start, spread, start[None] - [model.table.contact_distance, 0.0, 0.0, 0.0])
+    model.goal_window(0.1)
     model.simulate(start[None], 3, np.random.default_rng(0))
     tracker = PuckFilter(model)
     for step in range(12):

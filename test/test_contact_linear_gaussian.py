@@ -95,3 +95,52 @@ def test_data_that_determine_no_model_are_refused():
         LinearGaussian.fit(outputs[:-1], inputs)
     with pytest.raises(InvalidInputError, match="factor"):
         TRUE.widened(0.0)
+
+
+# Scatter that grows with a speed of approach.
+
+APPROACH = np.array([0.0, -1.0, 0.5])
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.5, 0.97])
+def test_how_scatter_grows_is_found_again(growth):
+    true = LinearGaussian(MATRIX, OFFSET, COVARIANCE, growth, APPROACH)
+    rng = np.random.default_rng(3)
+    inputs = rng.normal([0.5, -1.0, 2.0], [1.0, 0.8, 1.5], (20_000, 3))
+    outputs = true.sample(inputs, rng)
+    assert np.mean(true.distances(outputs, inputs)) == pytest.approx(2.0, rel=0.03)
+    model = LinearGaussian.fit(outputs, inputs, approach=APPROACH)
+    assert model.growth == pytest.approx(growth, abs=0.1)
+    np.testing.assert_allclose(model.covariance, COVARIANCE, atol=2e-5)
+    np.testing.assert_allclose(model.matrix, MATRIX, atol=3e-3)
+    for speed in (0.0, 2.0):
+        scale = true.scales([0.0, -speed, 0.0])
+        assert scale == pytest.approx(1.0 - growth + growth * speed**2)
+
+
+def test_weights_of_samples_count_as_that_many():
+    outputs, inputs = samples(300)
+    weights = np.tile([1.0, 0.0, 1.0], 100)
+    chosen = weights > 0.0
+    expected = LinearGaussian.fit(outputs[chosen], inputs[chosen])
+    found = LinearGaussian.fit(outputs, inputs, weights=weights)
+    np.testing.assert_allclose(found.matrix, expected.matrix)
+    np.testing.assert_allclose(found.covariance, expected.covariance)
+
+
+def test_log_densities_are_those_of_the_gaussian():
+    scipy_stats = pytest.importorskip("scipy.stats")
+    true = LinearGaussian(MATRIX, OFFSET, COVARIANCE, 0.7, APPROACH)
+    outputs, inputs = samples(20)
+    expected = [
+        scipy_stats.multivariate_normal(true.mean(xi), true.scales(xi) * COVARIANCE).logpdf(y)
+        for y, xi in zip(outputs, inputs, strict=True)
+    ]
+    np.testing.assert_allclose(true.log_densities(outputs, inputs), expected)
+
+
+def test_growth_out_of_range_is_refused():
+    with pytest.raises(InvalidInputError, match="grows"):
+        LinearGaussian(MATRIX, OFFSET, COVARIANCE, 1.0, APPROACH)
+    with pytest.raises(InvalidInputError, match="approach"):
+        LinearGaussian(MATRIX, OFFSET, COVARIANCE, 0.5, [1.0])

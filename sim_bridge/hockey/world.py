@@ -103,7 +103,7 @@ class AirHockeyWorld(ArmWorld):
         start, gains = np.array(self.scene.joints), gains or ArmGains()
         self.follower = TrajectoryFollower(self.robot.limits, self.robot.joint_names, start, follower)
         self.controller = JointController(
-            self.robot, gains.stiffness, np.diag(gains.damping), period=TIMESTEP
+            self.robot, gains.stiffness, np.diag(gains.damping), period=TIMESTEP, implicit=True
         )
         self.camera = Camera(camera, np.random.default_rng(seed))
         self.rules = RulesMonitor(self.robot.limits)

@@ -12,13 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.contact import puck_rollout
+from vpsto_ros.contact import puck_modes
 from vpsto_ros.contact.puck import PuckModel
 
 _TINY = 1e-9  # shorter times are none [s]
 _NEAR_STEP = 0.005  # for so long the mallet is taken to move evenly when the puck is near it [s]
-_LEAST_CLOSING = 5e-3  # slower, puck and mallet do not hit each other but move together [m/s]
-_GRAZING = 0.1  # cosine of the angle between normal and approach below which a hit grazes
 _MOST_CONTACTS = 16  # in one prediction; a puck that is squeezed has no end of them
 
 
@@ -164,7 +162,7 @@ class PuckMotion:
         if mallet is not None and self._near(belief.mean, mallet, duration):
             duration = min(duration, _NEAR_STEP)
         x, y, vx, vy = belief.mean
-        wall, axis, side = puck_rollout.next_wall(self._rows, x, y, vx, vy, duration)
+        wall, axis, side = puck_modes.next_wall(self._rows, x, y, vx, vy, duration)
         hit = math.inf if mallet is None else hit_time(
             belief.mean - mallet, self._model.table.contact_distance
         )  # fmt: skip
@@ -181,7 +179,7 @@ class PuckMotion:
 
     def _moved(self, belief: PuckBelief, duration: float) -> PuckBelief:
         mean, covariance = belief.mean.copy(), belief.covariance.copy()
-        puck_rollout.step(self._rows, duration / self._model.period, mean, covariance)
+        puck_modes.step(self._rows, duration / self._model.period, mean, covariance)
         return PuckBelief(belief.stamp + duration, mean, covariance, None, belief.contacts)
 
     def _bounce(self, belief: PuckBelief, time: float, axis: int, side: float) -> PuckBelief:
@@ -192,15 +190,14 @@ class PuckMotion:
         return self._begin("wall", met, belief.mean[2:], normal, np.zeros(2))
 
     def _hit(self, belief: PuckBelief) -> PuckBelief:
-        """Be hit by the mallet now, (5.3), as the mean is; the Jacobian says what other states do."""
+        """Be hit by the mallet now, (5.3), as the mean is; other states are hit otherwise, to first order."""
         mallet = self._track.at(belief.stamp)
         if mallet is None:  # it was seen to come, but is not known at that time
             return belief
         normal = _unit(belief.mean[:2] - mallet[:2])
-        after, noise = self._model.hit(belief.mean[None], mallet[None], delayed=False)
-        a = self._hit_jacobian(belief.mean, mallet, normal)
-        spread = a @ belief.covariance @ a.T + noise[0]
-        met = dataclasses.replace(belief, mean=after[0], covariance=0.5 * (spread + spread.T))
+        mean, covariance = belief.mean.copy(), belief.covariance.copy()
+        puck_modes.hits(self._rows, 0.0, mallet[None], mean[None], covariance[None])
+        met = dataclasses.replace(belief, mean=mean, covariance=covariance)
         return self._begin("mallet", met, belief.mean[2:], normal, self._mean_velocity(belief.stamp, mallet))
 
     def _mean_velocity(self, stamp: float, mallet: NDArray) -> NDArray[np.float64]:
@@ -208,21 +205,6 @@ class PuckMotion:
         duration = self._timing["mallet"].duration
         later = self._track.at(stamp + duration) if duration > 0.0 else None
         return mallet[2:] if later is None else (later[:2] - mallet[:2]) / duration
-
-    def _hit_jacobian(self, puck: NDArray, mallet: NDArray, normal: NDArray) -> NDArray[np.float64]:
-        """By central differences, shape (4, 4): other states meet the mallet at another time and angle."""
-        step = 1e-6
-        offsets = step * np.vstack([np.eye(4), -np.eye(4)])
-        relative = (puck - mallet)[2:]
-        # Where they graze, the time of the hit is no linear function of the state any more.
-        closing = max(-float(normal @ relative), _LEAST_CLOSING, _GRAZING * math.hypot(*relative))
-        shift = (offsets[:, :2] @ normal) / closing
-        before, other = puck + offsets, np.tile(mallet, (8, 1))
-        before[:, :2] += shift[:, None] * before[:, 2:]
-        other[:, :2] += shift[:, None] * mallet[2:]
-        after, _ = self._model.hit(before, other, delayed=False)
-        after[:, :2] -= shift[:, None] * after[:, 2:]
-        return (after[:4] - after[4:]).T / (2.0 * step)
 
     def _begin(
         self, surface: str, met: PuckBelief, before: NDArray, normal: NDArray, velocity: NDArray
@@ -271,7 +253,7 @@ def hit_time(relative: NDArray, distance: float) -> float:
     x, y, vx, vy = relative.tolist()
     b, c, square = x * vx + y * vy, x * x + y * y - distance**2, vx * vx + vy * vy
     apart = math.hypot(x, y)
-    if apart < 1e-6 or -b < _LEAST_CLOSING * apart:
+    if apart < 1e-6 or -b < puck_modes.LEAST_CLOSING * apart:
         return math.inf
     if c <= 0.0:
         return 0.0

@@ -18,7 +18,7 @@ from vpsto_ros.planning.shooting_config import (
     Strikes,
 )
 from vpsto_ros.planning.shooting_policy import PolicySamples, ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes, predict
+from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
 from vpsto_ros.planning.shooting_times import ContactTimes, Round
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
@@ -127,7 +127,7 @@ class ShootingPlanner:
     def _follow(self, shot: Shot, now: float, puck: PuckState) -> str:
         """Weigh the shot anew for what is now known of the puck; what speaks against it, else empty."""
         ahead = np.array([max(shot.time - puck.stamp, 0.0)])
-        mean, covariance = predict(self.search.model, puck.mean, puck.covariance, ahead)
+        mean, covariance = self.search.model.predict(puck.mean, puck.covariance, ahead)
         _, (_, objection) = self._times.places(mean, covariance)
         if objection:
             return objection

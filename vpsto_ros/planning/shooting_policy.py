@@ -96,7 +96,7 @@ class EnergyModel:
         """Angles (...,) scaled, and their sines and cosines, shape (..., 1 + 2 H)."""
         u = self._scaled(np.asarray(angles, dtype=float), 4)
         multiples = np.arange(1, (len(self.weights["first"]) - 3) // 2, dtype=np.float32)
-        phases = np.float32(np.pi) * u[..., None] * multiples
+        phases = np.multiply.outer(u, np.float32(np.pi) * multiples)
         return np.concatenate([u[..., None], np.sin(phases), np.cos(phases)], axis=-1)
 
     def energies(self, state: ArrayLike, angles: ArrayLike) -> NDArray[np.float32]:

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.contact.puck import PuckModel, ShotOutlook, contact_frames
+from vpsto_ros.contact.puck import PuckModel, ShotOutlook
 from vpsto_ros.planning.shooting_config import ShootingConfig, Shot, Strikes
 
-_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])  # turns by a quarter
 _LEAST_CLOSING = 0.05  # slower mallets hardly touch [m/s]
 
 
@@ -70,9 +69,22 @@ class ShotSearch:
         return inside
 
     def outlook(self, strokes: Strokes) -> ShotOutlook:
-        """What is expected of B strokes, with the errors of puck and mallet."""
-        mean, covariance = after_hit(self.model, strokes, self.config.aim_std, self.config.speed_std)
-        return self.model.outlook(mean, covariance)
+        """What is expected of B strokes.
+
+        Deviation: the thesis begins the rollout with Q_3 alone. Here the puck's state is uncertain, too, and
+        the mallet is off: its place across its motion and its speed have standard deviations. To first order
+        each is as if the puck were off: by the same distance, which turns the normal of the contact; and by
+        the speed that changes the outcome as much.
+        """
+        normal = np.stack([np.cos(strokes.angle), np.sin(strokes.angle)], axis=-1)
+        tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=-1)
+        mallet = np.hstack([strokes.puck[:, :2] - self._distance * normal, strokes.speed[:, None] * normal])
+        covariance = strokes.covariance.copy()
+        covariance[:, :2, :2] += self.config.aim_std**2 * tangent[:, :, None] * tangent[:, None, :]
+        by_puck, by_mallet = self.model.mallet.matrix[0, [0, 2]]  # of the speed along the normal
+        speed_std = self.config.speed_std * by_mallet / by_puck
+        covariance[:, 2:, 2:] += speed_std**2 * normal[:, :, None] * normal[:, None, :]
+        return self.model.shots(strokes.puck, covariance, mallet)
 
     def shot(self, strokes: Strokes, outlook: ShotOutlook, row: int) -> Shot:
         """One of them."""
@@ -156,75 +168,3 @@ def _peaks(ranks: NDArray, count: int) -> tuple[NDArray, NDArray]:
     slot, column = np.nonzero(peak)
     chosen = np.argsort(-ranks[slot, column], kind="stable")[:count]
     return slot[chosen], column[chosen]
-
-
-def after_hit(
-    model: PuckModel, strokes: Strokes, aim_std: float, speed_std: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gaussians of the puck after hits, with what is not known before them, to first order.
-
-    Deviation: the thesis begins with Q_3 alone. Here the state of the puck is uncertain, too, and the mallet
-    is off its place. What shifts them against each other across the motion turns the normal of the contact, by
-    the shift over the distance of their centres; what does so along the motion changes the time of the touch,
-    and with it the place of a puck that moves sideways.
-
-    Args:
-        model: of the puck.
-        strokes: B of them.
-        aim_std: standard deviation of the mallet's place across its motion [m].
-        speed_std: of its speed along it [m/s].
-
-    Returns:
-        mean (B, 4) and covariance (B, 4, 4).
-    """
-    normal = np.stack([np.cos(strokes.angle), np.sin(strokes.angle)], axis=-1)
-    distance, puck = model.table.contact_distance, strokes.puck
-    mallet = np.hstack([puck[:, :2] - distance * normal, strokes.speed[:, None] * normal])
-    mean, covariance = model.hit(puck, mallet)
-    frames = contact_frames(normal)
-    turned = frames.transpose(0, 2, 1)
-    theta_puck, theta_mallet = model.mallet.matrix[:, :2], model.mallet.matrix[:, 2:]
-    before, pushed = _times(turned, puck[:, 2:]), _times(turned, mallet[:, 2:])
-    after = before @ theta_puck.T + pushed @ theta_mallet.T + model.mallet.offset
-    # d/dphi of F f(F' v_puck, F' v_mallet), with dF = F S.
-    quarter = _QUARTER.T
-    change = after @ quarter - before @ quarter @ theta_puck.T - pushed @ quarter @ theta_mallet.T
-    turn = _times(frames, change) / distance
-    relative = before - pushed
-    sideways = relative[:, 1] / np.maximum(-relative[:, 0], _LEAST_CLOSING)
-    shift = frames[:, :, 1] + sideways[:, None] * frames[:, :, 0]
-    velocity = np.concatenate(
-        [turn[:, :, None] * shift[:, None, :], frames @ theta_puck @ turned], axis=2
-    )  # of the state before, (B, 2, 4)
-    jacobian = _with_delay(velocity, model.hit_delay)
-    jacobian[:, :2, :2] += np.eye(2)
-    jacobian[:, :2, 2:] += model.hit_delay * np.eye(2)
-    errors = np.stack([aim_std * turn, speed_std * (frames @ theta_mallet[:, 0])], axis=2)
-    errors = _with_delay(errors, model.hit_delay)
-    covariance += jacobian @ strokes.covariance @ jacobian.transpose(0, 2, 1)
-    covariance += errors @ errors.transpose(0, 2, 1)
-    return mean, covariance
-
-
-def _with_delay(velocity: NDArray, delay: float) -> NDArray[np.float64]:
-    """Changes (B, 4, n) of the state from those (B, 2, n) of the velocity that comes late."""
-    return np.concatenate([-delay * velocity, velocity], axis=1)
-
-
-def _times(matrices: NDArray, vectors: NDArray) -> NDArray[np.float64]:
-    return np.einsum("bij,bj->bi", matrices, vectors)
-
-
-def predict(
-    model: PuckModel, mean: NDArray, covariance: NDArray, times: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gaussian states (K, 4), (K, 4, 4) of the free puck at rising times (K,) from now [s], through walls."""
-    means, covariances = np.empty((len(times), 4)), np.empty((len(times), 4, 4))
-    passed = 0.0
-    for k, time in enumerate(times):
-        while time - passed > 1e-9:
-            duration = min(model.period, time - passed)
-            mean, covariance = model.step(mean, covariance, duration)
-            passed += duration
-        means[k], covariances[k] = mean, covariance
-    return means, covariances

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.planning.shooting_config import Shot
 from vpsto_ros.planning.shooting_policy import ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes, predict
+from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
 from vpsto_ros.robot.iiwa import iiwa14
 
 Objection = tuple[int, str]
@@ -76,8 +76,8 @@ class ContactTimes:
         current.times = current.times[current.times > now + _SOONEST]
         if not current.times.size:
             return None
-        ahead = current.times - puck.stamp
-        means, covariances = predict(self.search.model, puck.mean, puck.covariance, ahead)
+        ahead = np.maximum(current.times - puck.stamp, 0.0)
+        means, covariances = self.search.model.predict(puck.mean, puck.covariance, ahead)
         places, objection = self.places(means, covariances)
         slots, count = np.flatnonzero(places), config.times_per_step
         if self.policy is not None:

@@ -8,6 +8,7 @@ up and moved to the exact place.
 
 import dataclasses
 import json
+import math
 import pathlib
 from collections.abc import Iterable
 from typing import Any
@@ -49,7 +50,7 @@ class StrikeConfig:
     )  # fmt: skip
     brake: float = option(0.15, "time in which they come to rest", unit="s", minimum=0.11, maximum=1.0)
     lead_weight: float = option(
-        0.15, "price of a posture far from home, per second that its quickest joint motion takes",
+        0.5, "price of a posture far from home, per second that its quickest joint motion takes",
         unit="m/s²", minimum=0.0, maximum=10.0,
     )  # fmt: skip
     speed_share: float = option(
@@ -71,6 +72,7 @@ class StrikeTable:
         speed: largest speed of the mallet, shape (X, Y, A) [m/s]; 0 where there is no strike.
         posture: joint positions at the touch with the universal joint above the mallet, (X, Y, A, 7) [rad].
         rates: joint velocities there at that speed, (X, Y, A, 7) [rad/s].
+        contact_distance: between the centres of puck and mallet when they touch [m].
         config: how strikes run.
         rules: what they keep.
 
@@ -84,6 +86,7 @@ class StrikeTable:
     speed: NDArray[np.float64]
     posture: NDArray[np.float64]
     rates: NDArray[np.float64]
+    contact_distance: float
     config: StrikeConfig = dataclasses.field(default_factory=StrikeConfig)
     rules: PlayRules = dataclasses.field(default_factory=PlayRules)
 
@@ -121,10 +124,14 @@ class StrikeTable:
         _interpolate(self.speed, low, step, np.ascontiguousarray(where), found)
         return found
 
-    def cell(self, puck: ArrayLike, angle: float) -> tuple[int, int, int] | None:
-        """The entry nearest to a puck (2,) and an angle, None without a strike or outside of the table."""
+    def cell(self, mallet: ArrayLike) -> tuple[int, int, int] | None:
+        """The entry nearest to a state (4,) of the mallet at the touch, table frame; None without strike."""
+        x, y, vx, vy = np.asarray(mallet, dtype=float).tolist()
+        angle = math.atan2(vy, vx)
+        ahead = self.contact_distance
+        puck = x + ahead * math.cos(angle), y + ahead * math.sin(angle)
         index = []
-        for grid, value in zip(self.grids, (*np.asarray(puck, dtype=float), angle), strict=True):
+        for grid, value in zip(self.grids, (*puck, angle), strict=True):
             step = grid[1] - grid[0]
             if not grid[0] - 0.5 * step <= value <= grid[-1] + 0.5 * step:
                 return None
@@ -181,8 +188,8 @@ class StrikeTable:
             origin: where the table comes from (command, seed, figures), for people.
         """
         about = {
-            "format": FORMAT, "origin": origin, "config": dataclasses.asdict(self.config),
-            "rules": dataclasses.asdict(self.rules),
+            "format": FORMAT, "origin": origin, "contact_distance": self.contact_distance,
+            "config": dataclasses.asdict(self.config), "rules": dataclasses.asdict(self.rules),
         }  # fmt: skip
         np.savez_compressed(
             path, about=np.array(json.dumps(about)), x=self.x, y=self.y, angle=self.angle, speed=self.speed,
@@ -210,7 +217,9 @@ class StrikeTable:
             raise ConfigurationError(f"{path} is not of the format '{FORMAT}'")
         try:
             rules = {**about["rules"], "home": tuple(about["rules"]["home"])}
-            return cls(**arrays, config=StrikeConfig(**about["config"]), rules=PlayRules(**rules))
+            distance = float(about["contact_distance"])
+            config = StrikeConfig(**about["config"])
+            return cls(**arrays, contact_distance=distance, config=config, rules=PlayRules(**rules))
         except (KeyError, TypeError, InvalidInputError, ConfigurationError) as error:
             raise ConfigurationError(f"{path} is not a table of strikes: {error}") from None
 
@@ -258,7 +267,7 @@ def tabulate(
         twin = (i, len(y) - 1 - j, len(angle) - 1 - k)
         speed[i, j, k], posture[i, j, k], rates[i, j, k] = found
         speed[twin], posture[twin], rates[twin] = found[0], _MIRROR * found[1], _MIRROR * found[2]
-    return StrikeTable(x, y, angle, speed, posture, rates, config, rules)
+    return StrikeTable(x, y, angle, speed, posture, rates, contact_distance, config, rules)
 
 
 class _Search:
@@ -269,7 +278,7 @@ class _Search:
     ) -> None:
         limits, self._rules, self._distance = rules.limits(iiwa14()), rules, distance
         self._home = np.array(rules.home)
-        self._velocity, self._positions = config.speed_share * limits.velocity, 0.99 * limits.upper
+        self._velocity, self._positions = config.speed_share * limits.velocity, 0.99 * limits.position_range[1]
         self._row = np.array(
             [*rules.kernel_row(), config.run_up, config.hold, config.brake, config.lead_weight]
         )

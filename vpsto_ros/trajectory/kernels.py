@@ -19,7 +19,7 @@ BOUNDARY_TOLERANCE = 1e-9
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _slopes(knot_slopes, keys, start, end, alpha, beta):
+def slopes_at_knots(knot_slopes, keys, start, end, alpha, beta):
     """Slopes at the knots: alpha from the key positions, beta from the boundary velocities over duration."""
     size, dof = keys.shape
     for i in range(size):
@@ -154,7 +154,7 @@ def durations_kernel(knots, knot_slopes, keys, start, end, velocity, acceleratio
     duration = np.empty(batch)
     alpha, beta = np.empty((size, dof)), np.empty((size, dof))
     for b in range(batch):
-        _slopes(knot_slopes, keys[b], start[b], end[b], alpha, beta)
+        slopes_at_knots(knot_slopes, keys[b], start[b], end[b], alpha, beta)
         duration[b] = _minimal_duration(knots, keys[b], start[b], end[b], alpha, beta, velocity, acceleration)
     return duration
 
@@ -186,7 +186,7 @@ def synthesis_kernel(knots, knot_slopes, keys, start, end, velocity, acceleratio
     out = np.empty((3 if derivatives else 1, batch, u.size, dof))
     alpha, beta, cubic = np.empty((size, dof)), np.empty((size, dof)), np.empty((size - 1, 4, dof))
     for b in range(batch):
-        _slopes(knot_slopes, keys[b], start[b], end[b], alpha, beta)
+        slopes_at_knots(knot_slopes, keys[b], start[b], end[b], alpha, beta)
         duration[b] = _minimal_duration(knots, keys[b], start[b], end[b], alpha, beta, velocity, acceleration)
         if duration[b] == np.inf:
             out[:, b] = 0.0

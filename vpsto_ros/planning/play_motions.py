@@ -1,0 +1,167 @@
+"""Motions of the arm at the air-hockey table as problems for VP-STO: into a touch, and back home.
+
+Via-points are joint positions; what is searched is moved by the least joint motion to where the universal
+joint is in the plane of play, so that every candidate stays near it.
+"""
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vpsto_ros.optimization.progress import Evaluation
+from vpsto_ros.planning.play_kernels import assess, to_height
+from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.priors.gaussian import GaussianPrior
+from vpsto_ros.priors.smoothness import smoothness_prior
+from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, minimal_duration
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ArmState:
+    """Joint positions and velocities at a time.
+
+    Attributes:
+        time: when [s].
+        position: shape (7,) [rad].
+        velocity: shape (7,) [rad/s].
+    """
+
+    time: float
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Play:
+    """What all motions at one table share.
+
+    Attributes:
+        rules: of play.
+        limits: of the joints, as planned with.
+        spacing: time between the instants at which places are looked at [s].
+        spread: standard deviation of the prior over via-points [rad].
+        weights: of duration [1/s], effort and excess in the cost, (3,).
+    """
+
+    rules: PlayRules
+    limits: Limits
+    spacing: float = 0.02
+    spread: float = 0.12
+    weights: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.array([1.0, 0.3, 1e3]))
+
+    def raised(self, points: NDArray) -> NDArray[np.float64]:
+        """Joint positions (B, P, 7) moved into the plane of play."""
+        found = np.empty_like(points, dtype=float)
+        to_height(np.ascontiguousarray(points, dtype=float), self.rules.height, found)
+        return found
+
+    def assess(
+        self, basis: OptimalBasis, keys: NDArray, start: NDArray, end: NDArray, durations: NDArray
+    ) -> Evaluation:
+        """Costs of motions through key positions (B, N + 2, 7) with durations (B,)."""
+        cost, valid = np.empty(len(keys)), np.empty(len(keys), dtype=bool)
+        lower, upper = self.limits.position_range
+        assess(
+            basis.knots, basis.knot_slopes, keys, start, end, durations, self.limits.velocity,
+            self.limits.acceleration, lower, upper, self.rules.kernel_row(), self.spacing, self.weights, cost,
+            valid,
+        )  # fmt: skip
+        return Evaluation(cost, valid)
+
+
+class PlayMotion:
+    """A motion between two states of the arm, an :class:`~vpsto_ros.planning.mpc.OnlineProblem`.
+
+    Attributes:
+        start_time: when it begins [s].
+        begin, end: its two states; the time of the end counts only if it is given.
+    """
+
+    def __init__(self, play: Play, begin: ArmState, end: ArmState, guess: NDArray, last: float = 0.0) -> None:
+        """Pose the problem.
+
+        Args:
+            play: what all motions share.
+            begin: state at the beginning.
+            end: state at the end, to be reached at its time; as soon as the limits allow if that is infinite.
+            guess: a position on the way, shape (7,) [rad]: where the run-up begins, or where a brake ends.
+            last: for how long before the end there shall be no via-point, 0: evenly spaced ones [s].
+        """
+        self.play, self.begin, self.end, self.start_time = play, begin, end, begin.time
+        self._guess, self._last = guess, last
+        self._bases: dict[int, OptimalBasis] = {}
+
+    @property
+    def timed(self) -> bool:
+        """Whether the end is to be reached at a given time."""
+        return bool(np.isfinite(self.end.time))
+
+    def basis(self, n_via: int) -> OptimalBasis:
+        """With the last via-point where the run-up begins, if there is time for others before."""
+        if n_via not in self._bases:
+            basis = OptimalBasis.uniform(n_via)
+            total = self.end.time - self.begin.time
+            if n_via and self.timed and self._last < total / (n_via + 1):
+                late = 1.0 - self._last / total
+                basis = OptimalBasis(np.append(late * np.arange(1, n_via + 1) / n_via, 1.0))
+            self._bases[n_via] = basis
+        return self._bases[n_via]
+
+    def keys(self, points: NDArray) -> NDArray[np.float64]:
+        """Key positions (B, N + 2, 7) of via-points (B, N, 7)."""
+        keys = np.empty((len(points), points.shape[1] + 2, 7))
+        keys[:, 0], keys[:, -1] = self.begin.position, self.end.position
+        keys[:, 1:-1] = self.play.raised(points)
+        return keys
+
+    def _durations(self, keys: NDArray) -> NDArray[np.float64]:
+        if self.timed:
+            return np.full(len(keys), self.end.time - self.begin.time)
+        basis = self.basis(keys.shape[1] - 2)
+        return np.asarray(
+            minimal_duration(basis, keys, self.begin.velocity, self.end.velocity, self.play.limits)
+        )
+
+    def evaluate(self, points: NDArray) -> Evaluation:
+        """Cost and validity of candidates (B, N, 7)."""
+        keys = self.keys(points)
+        basis = self.basis(points.shape[1])
+        return self.play.assess(basis, keys, self.begin.velocity, self.end.velocity, self._durations(keys))
+
+    def trajectory(self, points: NDArray) -> Trajectory:
+        """The timed motion through via-points (N, 7)."""
+        keys = self.keys(points[None])
+        duration, basis = float(self._durations(keys)[0]), self.basis(len(points))
+        ends = np.array([self.begin.velocity, self.end.velocity])
+        by_keys, by_velocity = basis.knot_slopes[:, :-2], basis.knot_slopes[:, -2:]
+        velocities = by_keys @ (keys[0] - keys[0, 0]) / duration + by_velocity @ ends
+        return Trajectory.from_points(self.start_time + duration * basis.knots, keys[0], velocities)
+
+    def direct(self, previous: Trajectory | None) -> NDArray[np.float64]:
+        """No via-points."""
+        return np.zeros((0, 7))
+
+    def shifted(self, previous: Trajectory, n_via: int) -> NDArray[np.float64]:
+        """Via-points (N, 7) on what is left of the previous motion."""
+        finish = self.end.time if self.timed else previous.end_time
+        begin = min(self.start_time, previous.end_time)
+        times = begin + (finish - begin) * self.basis(n_via).phases[:-1]
+        return previous(np.minimum(times, previous.end_time))
+
+    def prior(self, n_via: int) -> GaussianPrior:
+        """Smoothness prior, (4.15)."""
+        total = self.end.time - self.begin.time if self.timed else 1.0
+        return smoothness_prior(
+            self.basis(n_via), self.begin.position, self.begin.velocity, self.end.position, self.end.velocity,
+            total, spread=self.play.spread,
+        )  # fmt: skip
+
+    def guesses(self, n_via: int) -> NDArray[np.float64]:
+        """Straight to the guess and on from there, and the mean of the prior, (2, N, 7)."""
+        share = np.arange(1, n_via + 1)[:, None] / n_via
+        if self.timed:
+            way = self.begin.position + share * (self._guess - self.begin.position)
+        else:
+            way = self._guess + (share - 1.0 / n_via) * (self.end.position - self._guess)
+        return np.stack([way, self.prior(n_via).mean_points])

@@ -1,0 +1,369 @@
+"""Model-predictive control of an arm that plays air hockey: through the touch, on, and back home (5.3, 4.4).
+
+Every cycle VP-STO plans anew from the motion that is being executed to the state of the mallet that the
+contact planner asks for. Joints are planned, not the plane: their limits hold at every instant, and the
+posture at the touch is the tabulated one in which the mallet is fast.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
+from vpsto_ros.optimization.vpsto import VpstoConfig
+from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
+from vpsto_ros.planning.play_motions import ArmState, Play, PlayMotion
+from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
+from vpsto_ros.planning.stitching import extended, resting
+from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.robot.iiwa import iiwa14
+from vpsto_ros.robot.iiwa_kinematics import arm_points
+from vpsto_ros.robot.mallet_tilt import MalletTilt
+from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize
+
+_SAME = 0.02  # contacts whose times differ by less are the same, told anew [s]
+_SAME_ANGLE = 0.35  # and whose directions do [rad]
+
+
+@documented
+@dataclasses.dataclass(frozen=True)
+class StrikeMpcConfig:
+    """Options of the planner.
+
+    Raises:
+        ConfigurationError: a value is out of range; the message names what is allowed.
+    """
+
+    lead: float = option(
+        0.02, "time from the start of planning to the moment a plan takes over", unit="s", minimum=0.0,
+        maximum=0.2,
+    )  # fmt: skip
+    longest: float = option(
+        1.6, "a motion into a touch begins at most so long before it", unit="s", minimum=0.2, maximum=5.0
+    )
+    least: float = option(
+        0.04, "so shortly before the touch the motion is not planned anew", unit="s", minimum=0.0, maximum=0.5
+    )
+    joint_tolerance: float = option(
+        0.1, "how far a joint may be from its reference before the arm counts as lost", unit="rad",
+        minimum=1e-3, maximum=1.0,
+    )  # fmt: skip
+    tilt: MalletTilt = dataclasses.field(default_factory=MalletTilt)
+    first_rounds: int = option(
+        3, "how often a new motion is planned with the swing of the mallet that the one before makes",
+        minimum=1, maximum=10,
+    )  # fmt: skip
+    approach: OnlineConfig = dataclasses.field(
+        default_factory=lambda: OnlineConfig(
+            n_via=4, via_rate=5.0, stop_duration=0.18, warm_sigma=0.2,
+            search=VpstoConfig(population=16, iterations=4),
+        )
+    )  # fmt: skip
+    home: OnlineConfig = dataclasses.field(
+        default_factory=lambda: OnlineConfig(
+            n_via=3, stop_duration=0.0, warm_sigma=0.2, search=VpstoConfig(population=12, iterations=2)
+        )
+    )
+    first_iterations: int = option(
+        20, "iterations of a search that has nothing to start from", minimum=1, maximum=1000
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MalletContact:
+    """What the contact planner asks for.
+
+    Attributes:
+        time: of the touch [s].
+        mallet: x, y, vx, vy of the mallet's centre then, table frame, shape (4,) [m, m/s].
+
+    Raises:
+        InvalidInputError: a number is not finite, or the mallet stands still.
+    """
+
+    time: float
+    mallet: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        mallet = np.array(self.mallet, dtype=float)
+        if mallet.shape != (4,) or not (np.isfinite(mallet).all() and np.isfinite(self.time)):
+            raise InvalidInputError(f"a contact needs a time and a state (4,), finite, got {self.mallet!r}")
+        if np.hypot(mallet[2], mallet[3]) < 1e-3:
+            raise InvalidInputError("a contact needs a mallet that moves")
+        mallet.setflags(write=False)
+        object.__setattr__(self, "mallet", mallet)
+
+    @property
+    def angle(self) -> float:
+        """Direction of the motion [rad]."""
+        return float(np.arctan2(self.mallet[3], self.mallet[2]))
+
+    def continues(self, other: "MalletContact | None") -> bool:
+        """Whether it is another one, told anew."""
+        if other is None or abs(self.time - other.time) > _SAME:
+            return False
+        turned = (self.angle - other.angle + np.pi) % (2.0 * np.pi) - np.pi
+        return bool(abs(turned) < _SAME_ANGLE)
+
+
+class StrikeMpc(ReferencePlanner):
+    """Plans step after step: waits at home, strikes when it is told where and when, follows through, returns.
+
+    Every trajectory that it gives contains the whole motion until the arm rests at home again, so that an arm
+    whose planner falls silent ends there. While no plan is found that keeps limits and rules, the motion that
+    runs goes on.
+
+    Attributes:
+        config: options.
+        table: the strikes.
+        contact: what is being carried out, None while nothing is.
+    """
+
+    def __init__(
+        self, table: StrikeTable, config: StrikeMpcConfig | None = None, *, seed: int = 0,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:  # fmt: skip
+        """Nothing is being followed yet.
+
+        Args:
+            table: the strikes.
+            config: options.
+            seed: of the searches.
+            clock: for deadlines of the searches [s].
+        """
+        self.config, self.table = config or StrikeMpcConfig(), table
+        super().__init__(iiwa14(), 2, self.config.lead, self.config.joint_tolerance, memory=1.0)
+        rules = table.rules
+        self.play = Play(rules, rules.limits(self.robot))
+        self.home, self._clock = np.array(rules.home), clock
+        rng = np.random.default_rng(seed)
+        self._approach = OnlineVpsto(self.config.approach, rng)
+        self._return = OnlineVpsto(self.config.home, rng)
+        self._first = {
+            online: dataclasses.replace(
+                online.config,
+                search=dataclasses.replace(online.config.search, iterations=self.config.first_iterations),
+            )
+            for online in (self._approach, self._return)
+        }
+        self._usual = {online: online.config for online in self._first}
+        self._swing: tuple[float, NDArray] | None = None
+        self.forget_plan()
+
+    def forget_plan(self) -> None:
+        """Do not warm-start from the last plan."""
+        self.contact: MalletContact | None = None
+        self._cell: tuple[int, int, int] | None = None
+        self._approach.accept(None)
+        self._return.accept(None)
+
+    def step(
+        self, now: float, joint_position: ArrayLike, joint_velocity: ArrayLike,
+        contact: MalletContact | None = None,
+    ) -> MpcStep:  # fmt: skip
+        """Plan once. Call :meth:`accept` with what is going to be executed.
+
+        Args:
+            now: time [s].
+            joint_position: measured, shape (7,) [rad].
+            joint_velocity: measured, shape (7,) [rad/s].
+            contact: what the mallet is to do, None to wait at home.
+
+        Raises:
+            InvalidInputError: a shape does not fit, or a number is not finite.
+        """
+        q, qd = (np.asarray(row, dtype=float) for row in (joint_position, joint_velocity))
+        if q.shape != (7,) or qd.shape != (7,) or not np.isfinite([now, *q, *qd]).all():
+            raise InvalidInputError("the state of the arm must be 7 finite positions and velocities")
+        if self._lost(now, q):
+            return self._take_over(now, q, qd)
+        self._follow_mallet(now)
+        takeover = now + self.config.lead
+        if self.contact is not None and takeover >= self.contact.time:
+            self.forget_contact()  # what follows is under way
+        if contact is not None and contact.time > takeover + self.config.least:
+            return self._strike(now, takeover, contact)
+        if self.contact is not None and contact is None:
+            return self._withdraw(now, takeover)
+        return self._go_on(now)
+
+    def forget_contact(self) -> None:
+        """The touch is over."""
+        self.contact, self._cell = None, None
+        self._approach.accept(None)
+        self._return.accept(None)
+
+    def _tool(self, q: ArrayLike) -> NDArray[np.float64]:
+        """Place of the universal joint (..., 2) in the base frame."""
+        rows = np.asarray(q, dtype=float)
+        return arm_points(rows.reshape(-1, 7))[:, 3, :2].reshape((*rows.shape[:-1], 2))
+
+    def _brake(self, takeover: float, position: NDArray, velocity: NDArray) -> Trajectory:
+        """Home, as fast as limits and rules allow."""
+        self._return.accept(None)
+        return self._homewards(ArmState(takeover, position, velocity))
+
+    def _take_over(self, now: float, q: NDArray, qd: NDArray) -> MpcStep:
+        """Begin with an arm that stands still, wherever it is."""
+        self.reset()
+        if np.abs(qd).max() > AT_REST:
+            return MpcStep(None, "wait", False, "the arm moves and does not follow this planner's reference")
+        at_rest = resting(q, now, now + self.config.lead)
+        begin = ArmState(now + self.config.lead, q, np.zeros(7))
+        try:
+            way, mode = self._homewards(begin), "return"
+        except InfeasibleError:
+            # From outside the plane of play: straight in the joints, which nothing in the way is known of.
+            keys, still = np.stack([q, self.home]), np.zeros(7)
+            way = synthesize(
+                OptimalBasis.uniform(0), keys, still, still, self.play.limits, start_time=begin.time
+            )
+            mode = "enter"
+        self.reference = at_rest
+        return MpcStep(at_rest.followed_by(way), mode, True, "on the way home")
+
+    def _go_on(self, now: float) -> MpcStep:
+        """What runs is right."""
+        running = self._running
+        if self._moves_after(now):
+            rest = running.clipped(max(now, running.start_time), running.end_time)
+            return MpcStep(rest, "follow", True, "")
+        position = running(running.end_time)
+        if np.abs(position - self.home).max() > 1e-3:
+            return self._stop(now, "return", "on the way home", valid=True)
+        return MpcStep(resting(position, now, now + 0.5), "hold", True, "waits at home")
+
+    def _moves_after(self, now: float) -> bool:
+        running = self._running
+        if running.end_time <= now + 1e-6:
+            return False
+        return bool(np.abs(running(running.end_time) - running(now)).max() > 1e-9)
+
+    def _withdraw(self, now: float, takeover: float) -> MpcStep:
+        """The contact is not wanted any more: go home."""
+        self.forget_contact()
+        position, velocity, _ = extended(self._running, takeover).state(takeover)
+        try:
+            way = self._homewards(ArmState(takeover, position, velocity))
+        except InfeasibleError:
+            return self._go_on(now)
+        return MpcStep(self._joined(now, way), "return", True, "the shot was called off")
+
+    def _follow_mallet(self, now: float) -> None:
+        """How the mallet swings now, from the motion that was asked for."""
+        running = self._running
+        if self._swing is None or not running.start_time <= self._swing[0] <= now:
+            self._swing = (now, np.zeros(4))
+            return
+        begin, state = self._swing
+        self._swing = (now, self.config.tilt.along(extended(running, now), now, begin, state))
+
+    def _strike(self, now: float, takeover: float, contact: MalletContact) -> MpcStep:
+        """Plan into the touch, on, and home."""
+        fresh = not contact.continues(self.contact)
+        cell = self.table.cell(contact.mallet) if fresh or self._cell is None else self._cell
+        if cell is None:
+            return self._refuse(now, takeover, fresh, "there is no strike in the table for this contact")
+        begin = self._begin(takeover, contact, fresh)
+        if fresh:
+            self._approach.accept(None)
+            self._return.accept(None)
+        whole = None if fresh else self._running
+        for _ in range(self.config.first_rounds if fresh else 1):
+            target = self._target(cell, contact, now, whole)
+            if target is None:
+                return self._refuse(now, takeover, fresh, "the mallet cannot be that fast there")
+            try:
+                result, approach, onwards = self._through(begin, target, self.table.start(cell))
+            except InfeasibleError as error:
+                return self._refuse(now, takeover, fresh, str(error))
+            whole = self._joined(now, approach.followed_by(onwards))
+        self.contact, self._cell = contact, cell
+        iterations = result.search.iterations if result.search is not None else 0
+        path = self._tool(whole(np.linspace(whole.start_time, whole.end_time, 40)))
+        return MpcStep(whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path)
+
+    def _through(
+        self, begin: ArmState, target: ArmState, run_up: NDArray
+    ) -> tuple[OnlineResult, Trajectory, Trajectory]:
+        """A motion into a touch and the one after it.
+
+        Raises:
+            InfeasibleError: none is found that keeps limits and rules.
+        """
+        result = self._plan(
+            self._approach, PlayMotion(self.play, begin, target, run_up, self.table.config.run_up)
+        )
+        if result.trajectory is None:
+            raise InfeasibleError("no motion into this contact keeps limits and rules")
+        onwards = self._follow_through(target)
+        self._approach.accept(result.trajectory)
+        return result, result.trajectory, onwards
+
+    def _refuse(self, now: float, takeover: float, fresh: bool, why: str) -> MpcStep:
+        """Go on with a contact that has been planned before; with a new one, do without."""
+        withdraw = fresh and self.contact is not None
+        step = self._withdraw(now, takeover) if withdraw else self._go_on(now)
+        return dataclasses.replace(step, valid=False, message=why)
+
+    def _begin(self, takeover: float, contact: MalletContact, fresh: bool) -> ArmState:
+        """Where planning begins: at the takeover, or later while there is time to wait."""
+        start = takeover
+        if fresh and self.contact is None:
+            start = max(takeover, contact.time - self.config.longest)
+        elif self._approach.previous is not None:
+            start = max(takeover, self._approach.previous.start_time)
+        position, velocity, _ = extended(self._running, start).state(start)
+        return ArmState(start, position, velocity)
+
+    def _target(
+        self, cell: tuple[int, int, int], contact: MalletContact, now: float, motion: Trajectory | None
+    ) -> ArmState | None:
+        """The arm's state at the touch, with the mallet swinging as a motion that is much like it makes it."""
+        mallet, aside, rate = contact.mallet, np.zeros(2), np.zeros(2)
+        if motion is not None and self._swing is not None:
+            tilt = self.config.tilt
+            begin, state = self._swing
+            aside, rate = tilt.displacement(tilt.along(motion, contact.time, begin, state))
+        place = mallet[:2] + self.table.rules.table - aside
+        found = self.table.contact(cell, place, mallet[2:] - rate)
+        if found is None or (np.abs(found[1]) > self.play.limits.velocity).any():
+            return None
+        return ArmState(contact.time, *found)
+
+    def _follow_through(self, target: ArmState) -> Trajectory:
+        """On at the speed of the touch while it lasts, then home.
+
+        Raises:
+            InfeasibleError: no such motion keeps limits and rules.
+        """
+        hold = self.table.config.hold
+        rows = np.stack([target.position, target.position + hold * target.velocity])
+        rates = np.stack([target.velocity, target.velocity])
+        on = Trajectory.from_points(np.array([target.time, target.time + hold]), rows, rates)
+        return on.followed_by(self._homewards(ArmState(target.time + hold, rows[1], target.velocity)))
+
+    def _homewards(self, begin: ArmState) -> Trajectory:
+        """From a state to rest at home.
+
+        Raises:
+            InfeasibleError: no such motion keeps limits and rules.
+        """
+        end = ArmState(np.inf, self.home, np.zeros(7))
+        rest = begin.position + 0.5 * self.table.config.brake * begin.velocity
+        result = self._plan(self._return, PlayMotion(self.play, begin, end, rest))
+        if result.trajectory is None:
+            raise InfeasibleError("no way home keeps limits and rules")
+        self._return.accept(result.trajectory)
+        return result.trajectory
+
+    def _plan(self, online: OnlineVpsto, motion: PlayMotion) -> OnlineResult:
+        online.config = self._first[online] if online.previous is None else self._usual[online]
+        return online.step(motion)
