@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.conversions import SIMULATED, observation_message, read_belief, read_state
 from vpsto_ros.nodes.hockey_table import UNKNOWN_YAW, HockeyTableConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message
@@ -23,7 +23,6 @@ from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.nodes.state_estimator import StateEstimator
 from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
-from vpsto_ros.robot.mallet_observer import MalletObserver
 
 FRAME = "iiwa_link_0"
 HOME = np.array([0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0])
@@ -168,17 +167,6 @@ def test_bad_input_is_refused_with_a_reason_and_harms_nothing(estimator, bad, re
     assert reason in estimator.node.complaints.recent()
     estimator.advance(0.1, each=each)
     np.testing.assert_allclose(states(estimator)[-1].pose[:2], [1.0, 0.0], atol=3e-3)
-
-
-def test_the_observer_agrees_with_pinocchio():
-    robot, rng, observer = iiwa14(), np.random.default_rng(2), MalletObserver()
-    for k in range(20):
-        q, qd = rng.uniform(robot.limits.lower, robot.limits.upper), rng.standard_normal(7)
-        found = observer.observe(0.01 * k, q, qd)
-        np.testing.assert_allclose(found[:2], robot.forward(q)[0][:2], atol=1e-9)
-        np.testing.assert_allclose(found[2:], (robot.jacobian(q) @ qd)[:2], atol=1e-9)
-    with pytest.raises(InvalidInputError, match="7 positions"):
-        observer.observe(0.0, np.zeros(6), np.zeros(7))
 
 
 def test_states_travel_between_table_and_base():
