@@ -36,6 +36,9 @@ class PuckFilterConfig:
         5e-7**0.5, "standard deviation of measured positions that come without one", unit="m", minimum=1e-6,
         maximum=0.1,
     )  # fmt: skip
+    velocity_std: float = option(
+        0.02, "likewise of measured velocities", unit="m/s", minimum=1e-6, maximum=10.0
+    )
     gate: float = option(
         25.0, "squared Mahalanobis distance beyond which a position is an outlier", minimum=1.0, maximum=1e6
     )
@@ -161,6 +164,31 @@ class PuckFilter:
             return Outcome("accepted", "first position")
         return self._place(self._belief, sighting)
 
+    def observe_velocity(self, velocity: ArrayLike, covariance: ArrayLike | None = None) -> Outcome:
+        """Take in a velocity that was measured together with the last accepted position.
+
+        Args:
+            velocity: vx, vy in the table's frame, shape (2,) [m/s].
+            covariance: of it, shape (2, 2); that of the configuration if None.
+
+        Returns:
+            "accepted"; "outlier" (too unlikely, or while a contact lasts, which changes it); "stale" (no
+            position is known) or "invalid: reason".
+        """
+        noise = self.config.velocity_std**2 * np.eye(2) if covariance is None else covariance
+        sighting, defect = _checked(0.0, velocity, noise)
+        if defect:
+            return Outcome("invalid", defect)
+        if self._belief is None:
+            return Outcome("stale", "no position is known")
+        if self._belief.touch is not None:
+            return Outcome("outlier", "a contact is under way")
+        corrected, distance = _corrected(self._belief, sighting, first=2)
+        if not distance <= self.config.gate:
+            return Outcome("outlier", f"squared Mahalanobis distance {distance:.3g} > {self.config.gate:g}")
+        self._belief = corrected
+        return Outcome("accepted")
+
     def observe_mallet(self, stamp: float, position: ArrayLike, velocity: ArrayLike) -> Outcome:
         """Take in a state of the mallet.
 
@@ -283,19 +311,23 @@ class PuckFilter:
         self._belief, self._pending = belief, []
 
 
-def _corrected(belief: PuckBelief, sighting: _Sighting) -> tuple[PuckBelief, float]:
-    """The belief after a measured position, and how far off that was (squared Mahalanobis distance)."""
-    expected, noise = belief.mean[:2], sighting.noise
+def _corrected(belief: PuckBelief, sighting: _Sighting, first: int = 0) -> tuple[PuckBelief, float]:
+    """The belief after a measured position, and how far off that was (squared Mahalanobis distance).
+
+    With `first` = 2 it is a velocity that was measured.
+    """
+    seen = slice(first, first + 2)
+    expected, noise = belief.mean[seen], sighting.noise
     if belief.touch is not None:
         dent = belief.touch.dent(belief.stamp)
         share = _DENT_SHARE * belief.touch.depth * belief.touch.normal
         expected, noise = expected + dent, noise + np.outer(share, share)
     innovation = sighting.position - expected
-    inverse = np.linalg.inv(belief.covariance[:2, :2] + noise)
-    gain = belief.covariance[:, :2] @ inverse
+    inverse = np.linalg.inv(belief.covariance[seen, seen] + noise)
+    gain = belief.covariance[:, seen] @ inverse
     # Joseph's form stays positive definite whatever the rounding.
     a = np.eye(4)
-    a[:, :2] -= gain
+    a[:, seen] -= gain
     spread = a @ belief.covariance @ a.T + gain @ noise @ gain.T
     mean = belief.mean + gain @ innovation
     corrected = dataclasses.replace(belief, mean=mean, covariance=0.5 * (spread + spread.T))

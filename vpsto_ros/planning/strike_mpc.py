@@ -48,6 +48,9 @@ class StrikeMpcConfig:
     least: float = option(
         0.04, "so shortly before the touch the motion is not planned anew", unit="s", minimum=0.0, maximum=0.5
     )
+    final: float = option(
+        0.1, "so shortly before the touch the motion is not called off", unit="s", minimum=0.0, maximum=1.0
+    )
     joint_tolerance: float = option(
         0.1, "how far a joint may be from its reference before the arm counts as lost", unit="rad",
         minimum=1e-3, maximum=1.0,
@@ -190,9 +193,22 @@ class StrikeMpc(ReferencePlanner):
             self.forget_contact()  # what follows is under way
         if contact is not None and contact.time > takeover + self.config.least:
             return self._strike(now, takeover, contact)
-        if self.contact is not None and contact is None:
+        if self.contact is not None and contact is None and self.contact.time > takeover + self.config.final:
             return self._withdraw(now, takeover)
         return self._go_on(now)
+
+    def mallet(self, now: float, joint_position: ArrayLike, joint_velocity: ArrayLike) -> NDArray[np.float64]:
+        """State (x, y, vx, vy) of the mallet's centre in the base frame, from the measured joints, (4,).
+
+        How it swings is what the motion that was asked for makes it.
+        """
+        self._follow_mallet(now)
+        aside = (np.zeros(2), np.zeros(2))
+        if self._swing is not None:
+            aside = self.config.tilt.displacement(self._swing[1])
+        q, qd = np.asarray(joint_position, dtype=float), np.asarray(joint_velocity, dtype=float)
+        velocity = self.robot.jacobian(q)[:2] @ qd
+        return np.concatenate([self._tool(q) + aside[0], velocity + aside[1]])
 
     def forget_contact(self) -> None:
         """The touch is over."""
@@ -258,6 +274,8 @@ class StrikeMpc(ReferencePlanner):
 
     def _follow_mallet(self, now: float) -> None:
         """How the mallet swings now, from the motion that was asked for."""
+        if self.reference is None:
+            return
         running = self._running
         if self._swing is None or not running.start_time <= self._swing[0] <= now:
             self._swing = (now, np.zeros(4))
@@ -275,37 +293,41 @@ class StrikeMpc(ReferencePlanner):
         if fresh:
             self._approach.accept(None)
             self._return.accept(None)
-        whole = None if fresh else self._running
-        for _ in range(self.config.first_rounds if fresh else 1):
-            target = self._target(cell, contact, now, whole)
-            if target is None:
-                return self._refuse(now, takeover, fresh, "the mallet cannot be that fast there")
-            try:
-                result, approach, onwards = self._through(begin, target, self.table.start(cell))
-            except InfeasibleError as error:
-                return self._refuse(now, takeover, fresh, str(error))
-            whole = self._joined(now, approach.followed_by(onwards))
+        try:
+            result, whole = self._through(now, begin, cell, contact, None if fresh else self._running)
+            for _ in range(self.config.first_rounds - 1 if fresh else 0):
+                result, whole = self._through(now, begin, cell, contact, whole)
+        except InfeasibleError as error:
+            return self._refuse(now, takeover, fresh, str(error))
         self.contact, self._cell = contact, cell
         iterations = result.search.iterations if result.search is not None else 0
         path = self._tool(whole(np.linspace(whole.start_time, whole.end_time, 40)))
         return MpcStep(whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path)
 
     def _through(
-        self, begin: ArmState, target: ArmState, run_up: NDArray
-    ) -> tuple[OnlineResult, Trajectory, Trajectory]:
-        """A motion into a touch and the one after it.
+        self, now: float, begin: ArmState, cell: tuple[int, int, int], contact: MalletContact,
+        motion: Trajectory | None,
+    ) -> tuple[OnlineResult, Trajectory]:  # fmt: skip
+        """The running motion, one from it into a touch, and the one after that.
+
+        Args:
+            now: time [s].
+            begin: where planning begins.
+            cell: entry of the table.
+            contact: the touch.
+            motion: much like the one that is planned, to tell how the mallet will swing.
 
         Raises:
             InfeasibleError: none is found that keeps limits and rules.
         """
-        result = self._plan(
-            self._approach, PlayMotion(self.play, begin, target, run_up, self.table.config.run_up)
-        )
+        target = self._target(cell, contact, now, motion)
+        run_up, duration = self.table.start(cell), self.table.config.run_up
+        result = self._plan(self._approach, PlayMotion(self.play, begin, target, run_up, duration))
         if result.trajectory is None:
             raise InfeasibleError("no motion into this contact keeps limits and rules")
         onwards = self._follow_through(target)
         self._approach.accept(result.trajectory)
-        return result, result.trajectory, onwards
+        return result, self._joined(now, result.trajectory.followed_by(onwards))
 
     def _refuse(self, now: float, takeover: float, fresh: bool, why: str) -> MpcStep:
         """Go on with a contact that has been planned before; with a new one, do without."""
@@ -325,8 +347,12 @@ class StrikeMpc(ReferencePlanner):
 
     def _target(
         self, cell: tuple[int, int, int], contact: MalletContact, now: float, motion: Trajectory | None
-    ) -> ArmState | None:
-        """The arm's state at the touch, with the mallet swinging as a motion that is much like it makes it."""
+    ) -> ArmState:
+        """The arm's state at the touch, with the mallet swinging as a motion much like it makes it.
+
+        Raises:
+            InfeasibleError: the arm cannot be there, or not so fast.
+        """
         mallet, aside, rate = contact.mallet, np.zeros(2), np.zeros(2)
         if motion is not None and self._swing is not None:
             tilt = self.config.tilt
@@ -335,7 +361,7 @@ class StrikeMpc(ReferencePlanner):
         place = mallet[:2] + self.table.rules.table - aside
         found = self.table.contact(cell, place, mallet[2:] - rate)
         if found is None or (np.abs(found[1]) > self.play.limits.velocity).any():
-            return None
+            raise InfeasibleError("the mallet cannot be that fast there")
         return ArmState(contact.time, *found)
 
     def _follow_through(self, target: ArmState) -> Trajectory:

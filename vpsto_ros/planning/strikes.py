@@ -278,7 +278,8 @@ class _Search:
     ) -> None:
         limits, self._rules, self._distance = rules.limits(iiwa14()), rules, distance
         self._home = np.array(rules.home)
-        self._velocity, self._positions = config.speed_share * limits.velocity, 0.99 * limits.position_range[1]
+        self._velocity = config.speed_share * limits.velocity
+        self._positions = 0.99 * limits.position_range[1]
         self._row = np.array(
             [*rules.kernel_row(), config.run_up, config.hold, config.brake, config.lead_weight]
         )
