@@ -238,7 +238,7 @@ def test_the_arm_waits_at_home(striker):
 
 def test_the_mallet_is_where_it_should_be_when_it_should(striker):
     striker.advance(0.1, each=lambda _: arm(striker))
-    due = striker.time + 1.0
+    due = striker.time + 1.6
     striker.advance(0.3, each=told(striker, due))
     trajectory = last_trajectory(striker)
     robot = iiwa14()
@@ -253,7 +253,7 @@ def test_the_mallet_is_where_it_should_be_when_it_should(striker):
 
 def test_a_shot_that_is_not_told_any_more_is_called_off(striker):
     striker.advance(0.1, each=lambda _: arm(striker))
-    due = striker.time + 1.2
+    due = striker.time + 1.6
     striker.advance(0.2, each=told(striker, due))
     assert striker.node.planner.contact is not None
     striker.advance(0.2, each=lambda _: follow(striker))
