@@ -128,6 +128,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.shooting_policy",
         "the energy-based shooting policy and direct search",
     ),
+    "goal_probability": Choice(
+        "sim_bridge.experiments.hockey.goal_probability",
+        "whether shots score as often as the puck model says",
+    ),
 }
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),

@@ -11,6 +11,8 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.puck import ShotOutlook
 from vpsto_ros.exceptions import ConfigurationError
 
+_MISSING = 2.0  # price of a missing chance, in units of the objective
+
 
 class Strikes(Protocol):
     """What the arm can do: largest speeds (5.13) of the mallet along its motion, and the time they need."""
@@ -61,6 +63,15 @@ class ShootingObjective:
     def allowed(self, outlook: ShotOutlook) -> NDArray[np.bool_]:
         """Which shots (B,) keep the chance constraint and meet walls enough."""
         return (outlook.goal > self.beta) & (outlook.banks >= self.least_banks)
+
+    def promise(self, outlook: ShotOutlook) -> NDArray[np.float64]:
+        """Values (B,) less what is missing of the constraints: how much better an angle nearby may be.
+
+        Between two angles of a grid that both miss the threshold there may be one that exceeds it.
+        """
+        missing = np.maximum(self.beta - outlook.goal, 0.0)
+        few = outlook.banks < self.least_banks
+        return self.values(outlook) - _MISSING * (self.lambda1 + self.lambda2) * missing - 10.0 * few
 
     def scores(self, outlook: ShotOutlook) -> NDArray[np.float64]:
         """Values (B,) of allowed shots; the others rank below all of these, by their chance to score.

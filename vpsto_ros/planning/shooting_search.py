@@ -141,15 +141,16 @@ class ShotSearch:
             times[slot], pucks[slot], covariances[slot], self.angles[column], speeds[slot, column]
         )
         outlook = self.outlook(grid)
-        ranks = np.full(speeds.shape, -np.inf)
-        ranks[slot, column] = self.ranked(grid.time, outlook)
+        ranks = self.ranked(grid.time, outlook)
+        promise = np.full(speeds.shape, -np.inf)
+        promise[slot, column] = self.config.objective.promise(outlook) - self.config.delay_price * grid.time
         row = np.full(speeds.shape, -1)
         row[slot, column] = np.arange(len(slot))
-        fine = self._refined(grid, row[_peaks(ranks, self.config.peaks)])
+        fine = self._refined(grid, row[_peaks(promise, self.config.peaks)])
         chances = self.outlook(fine)
         finest = self.ranked(fine.time, chances)
-        first, second = int(np.argmax(ranks[slot, column])), int(np.argmax(finest)) if finest.size else -1
-        if second >= 0 and finest[second] > ranks[slot, column][first]:
+        first, second = int(np.argmax(ranks)), int(np.argmax(finest)) if finest.size else -1
+        if second >= 0 and finest[second] > ranks[first]:
             return self.shot(fine, chances, second)
         return self.shot(grid, outlook, first)
 
@@ -168,10 +169,10 @@ class ShotSearch:
         return grid.with_angles(rows[there], angle[there], speed[there])
 
 
-def _peaks(ranks: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Where (K, A) ranks are highest among their neighbours in a row: the best few."""
-    padded = np.pad(ranks, ((0, 0), (1, 1)), constant_values=-np.inf)
-    peak = np.isfinite(ranks) & (ranks >= padded[:, :-2]) & (ranks > padded[:, 2:])
+def _peaks(values: NDArray, count: int) -> tuple[NDArray, NDArray]:
+    """Where (K, A) values are higher than their neighbours in a row: the best few."""
+    padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peak = np.isfinite(values) & (values >= padded[:, :-2]) & (values > padded[:, 2:])
     slot, column = np.nonzero(peak)
-    chosen = np.argsort(-ranks[slot, column], kind="stable")[:count]
+    chosen = np.argsort(-values[slot, column], kind="stable")[:count]
     return slot[chosen], column[chosen]
