@@ -24,7 +24,7 @@ def planner(setting="conservative", strikes=None, **options):
 
 
 def state(stamp, mean, std=NOISE, touching=""):
-    return PuckState(stamp, np.array(mean, dtype=float), np.diag(std**2), 0, touching)
+    return PuckState(stamp, np.array(mean, dtype=float), np.diag((std**2).real), 0, touching)
 
 
 def course(start, steps):
@@ -78,6 +78,24 @@ def test_a_shot_ends_with_the_touch_and_another_is_planned():
     assert len(set(times)) >= 2
     for k, shot in enumerate(shots):
         assert shot is None or shot.time > PERIOD * k
+
+
+def test_no_shot_is_planned_while_the_mallet_goes_through_the_touch():
+    agent, states = planner(), course([-0.4, 0.1, 0.0, 0.0], 60)
+    shots = run(agent, states)
+    touch = shots[first(shots)].time
+    for k, shot in enumerate(shots):
+        if 0.0 <= PERIOD * k - touch < agent.config.pause - 1e-9:
+            assert shot is None
+    assert any(shot is not None and shot.time > touch for shot in shots)
+
+
+def test_a_clock_that_is_set_back_begins_anew():
+    agent, states = planner(), course([-0.4, 0.1, 0.0, 0.0], 10)
+    run(agent, states, begin=1e6)
+    assert agent.committed.time > 1e6
+    shots = run(agent, states, begin=5.0)
+    assert 5.0 < shots[-1].time < 7.0
 
 
 def test_clocks_that_count_from_long_ago_do_not_matter():
@@ -244,6 +262,7 @@ def test_forget_forgets():
         ([-1.1, 0.0, -1.0, 0.0], NOISE, "has left the table"),
         ([math.nan, 0.0, 0.0, 0.0], NOISE, "not finite"),
         ([-0.4, 0.0, 0.0, math.inf], NOISE, "not finite"),
+        ([-0.4, 0.0, 0.0, 0.0], np.array([1e-3, 1e-3, 1e-3, 1e-3j]), "negative variance"),
         ([-0.45, 0.0, 0.0, 0.0], np.array([0.05, 0.05, 0.1, 0.1]), "uncertain by"),
         ([-0.45, 0.0, 0.0, 0.0], np.array([2e-3, 2e-3, 0.4, 0.4]), "uncertain by"),
     ],

@@ -25,6 +25,8 @@ __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner",
 
 SEARCHING = "contact times are being searched"
 """Why there is no shot yet, before the first round is over."""
+STRUCK = "the puck has just been struck"
+"""Why there is no shot for a moment after a touch."""
 _ALIKE = (0.03, 0.15)  # times [s] and directions [rad] of shots that are much alike
 _REMEMBERED = 8  # shots that were refused
 _SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
@@ -68,12 +70,17 @@ class ShootingPlanner:
         self.search = ShotSearch(model, strikes, self.config)
         self._times = ContactTimes(self.search, policy, self._rng)
         self.committed: Shot | None = None
-        self._barred: list[Shot] = []
         self.forget()
 
     def forget(self) -> None:
-        """Drop the shot and begin to search anew."""
-        self.committed, self.reason = None, SEARCHING
+        """Begin anew, as after a restart."""
+        self._drop(SEARCHING)
+        self._barred: list[Shot] = []
+        self._now = self._struck = -math.inf  # times of the last step and of the last touch [s]
+
+    def _drop(self, reason: str) -> None:
+        """Let go of the shot, and of what the search has found."""
+        self.committed, self.reason = None, reason
         self._before: Shot | None = None
         self._share = 1.0  # of the largest speed that the chosen shot has
         self._round: Round | None = None
@@ -83,7 +90,7 @@ class ShootingPlanner:
     def refuse(self) -> None:
         """The arm cannot do the chosen shot: back to the one before, if any, and never that again."""
         shot, before = self.committed, self._before
-        self.forget()
+        self._drop(SEARCHING)
         if shot is not None:
             self._barred = [*self._barred[-_REMEMBERED:], shot]
         if before is not None:
@@ -107,8 +114,14 @@ class ShootingPlanner:
         if objection or puck is None:
             self._drop(objection)
             return None
-        if self.committed is not None and now >= self.committed.time:
+        if now < self._now:  # a clock that was set back
             self.forget()
+        self._now = now
+        if self.committed is not None and now >= self.committed.time:
+            self._struck = self.committed.time
+            self._drop(STRUCK)
+        if now - self._struck < self.config.pause:
+            return None
         if self.committed is not None:
             objection = self._follow(self.committed, now, puck)
             if objection:
@@ -116,10 +129,6 @@ class ShootingPlanner:
         if self.committed is None or self.committed.time - now > self.config.frozen:
             self._look_around(now, puck, posture)
         return self.committed
-
-    def _drop(self, reason: str) -> None:
-        self.forget()
-        self.reason = reason
 
     def _objection(self, now: float, puck: PuckState | None, joints: NDArray) -> str:
         """What makes planning pointless, else empty."""
@@ -133,6 +142,8 @@ class ShootingPlanner:
             return "the puck's state has not the shapes (4,) and (4, 4)"
         if not (np.isfinite(puck.mean).all() and np.isfinite(puck.covariance).all()):
             return "the puck's state is not finite"
+        if (np.diag(puck.covariance) < 0.0).any():
+            return "the puck's state has a negative variance"
         if abs(now - puck.stamp) > self.config.oldest:
             return f"the puck's state is {now - puck.stamp:.2f} s old"
         if self._times.off_table(puck.mean[None])[0]:

@@ -198,6 +198,10 @@ class ShootingConfig:
         0.25, "time before the touch in which the shot only follows the puck", unit="s", minimum=0.0,
         maximum=2.0,
     )  # fmt: skip
+    pause: float = option(
+        0.1, "time after a touch before another shot is planned: the mallet goes on through it", unit="s",
+        minimum=0.0, maximum=2.0,
+    )  # fmt: skip
     largest_jump: float = option(
         0.05, "of the place of the touch from step to step, beyond which the shot is dropped", unit="m",
         minimum=1e-3, maximum=1.0,
