@@ -128,9 +128,12 @@ EXPERIMENTS = {
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),
     "strikes": Choice("sim_bridge.learn.strikes", "in which posture the iiwa strikes a puck fastest"),
+    "shooting_policy": Choice(
+        "sim_bridge.learn.shooting_policy", "at which angle to shoot, from what direct search finds"
+    ),
 }
 
-LEARNED_FILES = {"puck_model": ".json", "strikes": ".npz"}
+LEARNED_FILES = {"puck_model": ".json", "strikes": ".npz", "shooting_policy": ".npz"}
 
 
 def positive(text: str) -> float:

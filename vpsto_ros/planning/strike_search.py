@@ -246,7 +246,7 @@ def search_posture(x, y, angle, limits, positions, rules, home, seeds, noise, re
         rates: output (7,).
 
     Returns:
-        speed [m/s], breaches.
+        score, speed [m/s], breaches.
     """
     work = (np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6)), np.empty((3, 6)), np.empty(7))
     points, axes, jac = work[0], work[1], work[2]
@@ -278,6 +278,5 @@ def search_posture(x, y, angle, limits, positions, rules, home, seeds, noise, re
             best = score
             posture[:] = q
     if best == _BAD:
-        return 0.0, np.inf
-    result = rate_posture(posture, angle, limits, positions, rules, home, rates, curvature, work)
-    return result[1], result[2]
+        return _BAD, 0.0, np.inf
+    return rate_posture(posture, angle, limits, positions, rules, home, rates, curvature, work)
