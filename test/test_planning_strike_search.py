@@ -102,7 +102,7 @@ def test_the_search_returns_what_it_rates_and_is_never_worse_than_its_seeds():
     rules, rng = PlayRules(), np.random.default_rng(1009)
     robot = iiwa14()
     limits = rules.limits(robot)
-    row = np.array([*rules.kernel_row(), 0.2, 0.045, 0.15, 0.5])
+    row = np.array([*rules.kernel_row(), 0.2, 0.045, 0.15, 0.5, 10.0])
     positions = 0.99 * limits.position_range[1]
     for angle in (0.0, 0.6):
         posture, rates = np.zeros(7), np.zeros(7)
@@ -130,7 +130,7 @@ def test_the_search_returns_what_it_rates_and_is_never_worse_than_its_seeds():
 
 def test_a_place_out_of_reach_has_no_strike():
     rules, posture, rates = PlayRules(), np.zeros(7), np.zeros(7)
-    row = np.array([*rules.kernel_row(), 0.2, 0.045, 0.15, 0.5])
+    row = np.array([*rules.kernel_row(), 0.2, 0.045, 0.15, 0.5, 10.0])
     _, speed, breaches = search_posture(
         3.0, 0.0, 0.0, LIMITS, 3.0 * np.ones(7), row, HOME, np.tile(HOME, (5, 1)), np.zeros((8, 7)), 5,
         posture, rates,

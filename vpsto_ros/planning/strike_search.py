@@ -23,7 +23,7 @@ _PARALLEL = 1e-7  # columns of the Jacobian whose cross product is less [m^2]
 _NO_PART = 1e-8  # of a joint in the dual, relative to its length [m]
 
 # Entries of the row of rules: the first six are those of PlayRules.kernel_row, the others of StrikeConfig.
-HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT, RUN_UP, HOLD, BRAKE, LEAD_WEIGHT = range(10)
+HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT, RUN_UP, HOLD, BRAKE, LEAD_WEIGHT, STEEPNESS = range(11)
 
 
 @njit(cache=True, nogil=True)
@@ -154,7 +154,11 @@ def straighten(q, rates, jac, curvature, probe, points, axes, other):
 
 @njit(cache=True, nogil=True)
 def _overspeed(rates, curvature, limits, rules):
-    """Largest share of the velocity limits on the way, at least 1."""
+    """Largest share of the limits of velocity and acceleration on the way, at least 1.
+
+    Those of acceleration are the STEEPNESS of the rules [1/s] times those of velocity. Accelerations are
+    linear in s while the joints accelerate and while they brake, so that the ends count.
+    """
     begin, hold, end = -0.5 * rules[RUN_UP], rules[HOLD], rules[HOLD] + 0.5 * rules[BRAKE]
     worst = 1.0
     for i in range(_SAMPLES):
@@ -167,6 +171,12 @@ def _overspeed(rates, curvature, limits, rules):
             pace = math.sqrt(max(0.0, 1.0 - (s - hold) / (end - hold)))
         for k in range(6):
             worst = max(worst, pace * abs(rates[k] + curvature[k] * s) / limits[k])
+    for k in range(6):
+        rise, fall, bend = 1.0 / rules[RUN_UP], 1.0 / rules[BRAKE], curvature[k]
+        steepest = max(abs(rise * (rates[k] + begin * bend)), abs(rise * rates[k] + bend))
+        steepest = max(steepest, abs(fall * (rates[k] + hold * bend) - bend))
+        steepest = max(steepest, abs(fall * (rates[k] + end * bend)))
+        worst = max(worst, steepest / (limits[k] * rules[STEEPNESS]))
     return worst
 
 
