@@ -124,6 +124,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
+    "goal_probability": Choice(
+        "sim_bridge.experiments.hockey.goal_probability",
+        "whether shots score as often as the puck model says",
+    ),
 }
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),

@@ -1,33 +1,34 @@
 """What the simulated driver publishes, made from the simulation."""
 
-import dataclasses
 import math
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
+from sim_bridge.arm_world import ArmWorld
+from sim_bridge.camera import CameraFrame
 from sim_bridge.scene import CUBE_SIDE
 from sim_bridge.simulation import Simulation
 from vpsto_ros.contact.geometry import PlanarShape
-from vpsto_ros.estimation.object_state import ObjectState
+from vpsto_ros.estimation.object_state import ObjectState, wrap_angle
 from vpsto_ros.nodes import markers
-from vpsto_ros.nodes.conversions import SIMULATED, state_message
+from vpsto_ros.nodes.conversions import SIMULATED, observation_message, state_message
 from vpsto_ros.nodes.joint_conversions import joint_state_message
 from vpsto_ros.robot.tip_kinematics import BALL_RADIUS, HAND_HALF_SIZE
 
 
-def measured_joints(simulation: Simulation, frame: str) -> JointState:
+def measured_joints(simulation: ArmWorld, frame: str) -> JointState:
     """Measured positions, velocities and torques."""
     position, velocity = simulation.joint_position, simulation.joint_velocity
     names, stamp = simulation.robot.joint_names, SIMULATED.stamp(simulation.time)
     return joint_state_message(names, position, velocity, simulation.joint_torque, stamp, frame)
 
 
-def desired_joints(simulation: Simulation, frame: str) -> JointState:
+def desired_joints(simulation: ArmWorld, frame: str) -> JointState:
     """The reference that the controller follows."""
     position, velocity, _ = simulation.follower.reference(simulation.time)
     names, stamp = simulation.robot.joint_names, SIMULATED.stamp(simulation.time)
@@ -43,10 +44,18 @@ def external_wrench(simulation: Simulation, frame: str) -> WrenchStamped:
     return message
 
 
-def true_object(simulation: Simulation, frame: str) -> Odometry:
+def seen_object(simulation: ArmWorld, seen: CameraFrame, frame: str) -> PoseWithCovarianceStamped:
+    """What the camera saw."""
+    stamp, height = SIMULATED.stamp(seen.stamp), simulation.surface
+    return observation_message(seen.pose, seen.covariance, stamp, frame, height)
+
+
+def true_object(simulation: ArmWorld, frame: str) -> Odometry:
     """Where the object really is."""
     pose, twist = simulation.object_pose(), simulation.object_twist()
-    return state_message(ObjectState(simulation.time, pose, twist, np.zeros((6, 6))), SIMULATED, frame)
+    pose[2] = wrap_angle(pose[2])
+    state = ObjectState(simulation.time, pose, twist, np.zeros((6, 6)))
+    return state_message(state, SIMULATED, frame, height=simulation.surface)
 
 
 def true_tools(simulation: Simulation, frame: str) -> list[Odometry]:
@@ -99,7 +108,7 @@ def scene_markers(simulation: Simulation, frame: str) -> MarkerArray:
     return MarkerArray(markers=drawn)
 
 
-def figures(simulation: Simulation) -> dict[str, Any]:
+def figures(simulation: ArmWorld) -> dict[str, Any]:
     """What the diagnostics say about limits and tracking."""
     controller = simulation.controller
     values: dict[str, Any] = {
@@ -108,10 +117,7 @@ def figures(simulation: Simulation) -> dict[str, Any]:
         "limit_violations": simulation.limits.violations,
         "torque_saturations": int(controller.saturated.sum()),
         "torque_rate_saturations": int(controller.rate_limited.sum()),
-        "tool_height_deviation_mm": f"{1e3 * simulation.tool_height_deviation:.3f}",
     }
-    for name, count in dataclasses.asdict(simulation.robot_contacts).items():
-        values[f"contact.{name}.steps"] = count
     for kind, seen in simulation.limits.report().items():
         # The controller ramps torques, so that their rate says what was asked for, not what the arm saw.
         group = "demand" if kind == "torque_rate" else "limit"

@@ -5,7 +5,6 @@ requests into a queue that the physics take between two slices. So nothing ever 
 step, and no step is lost.
 """
 
-import dataclasses
 import math
 import queue
 import sys
@@ -17,11 +16,9 @@ from concurrent.futures import TimeoutError as FutureTimeout
 from typing import Any
 
 import numpy as np
-import rclpy
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped, WrenchStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.executors import Executor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rosgraph_msgs.msg import Clock
@@ -31,68 +28,25 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from sim_bridge import driver_messages as messages
-from sim_bridge.camera import CameraConfig
-from sim_bridge.impedance import ImpedanceConfig
+from sim_bridge.driver_cell import DriverCell
+from sim_bridge.driver_config import AIR_HOCKEY, PUSHING, FrankaDriverConfig
+from sim_bridge.hockey.cell import AirHockeyCell
 from sim_bridge.pacing import Pacer, Ticker
-from sim_bridge.scene import Scene
-from sim_bridge.simulation import Simulation
-from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryCommand, TrajectoryRejected
-from vpsto_ros.configuration import documented, option, validate
+from sim_bridge.pushing_cell import PushingCell
+from sim_bridge.spinning import Spinning
+from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.nodes.conversions import (
-    SIMULATED,
-    observation_message,
-    require_finite,
-    require_frame,
-)
+from vpsto_ros.nodes.conversions import SIMULATED
 from vpsto_ros.nodes.diagnostics import ERROR, OK, Diagnostics, Pulse
 from vpsto_ros.nodes.joint_conversions import read_trajectory
-from vpsto_ros.nodes.lifecycle import ManagedNode, NodeConfig, best_effort, latched, reliable, run
-from vpsto_ros.nodes.scene import ShapeConfig
+from vpsto_ros.nodes.lifecycle import ManagedNode, best_effort, latched, reliable, run
+from vpsto_ros.nodes.stop_signals import StopSignals
 
 SLICE = 0.005
 """Simulated time between two looks at the queue [s]."""
 
 
-@documented
-@dataclasses.dataclass(frozen=True)
-class FrankaDriverConfig(NodeConfig):
-    """Parameters of the simulated driver."""
-
-    real_time_factor: float = option(
-        1.0, "simulated seconds per real second", unit="s/s", minimum=0.01, maximum=100.0
-    )
-    seed: int = option(0, "seed of camera noise and drop-outs", minimum=0)
-    clock_rate: float = option(100.0, "rate of /clock", unit="Hz", minimum=10.0, maximum=200.0)
-    joint_state_rate: float = option(100.0, "rate of joint_states", unit="Hz", minimum=10.0, maximum=200.0)
-    report_rate: float = option(
-        50.0, "rate of external_wrench and ground truth", unit="Hz", minimum=1.0, maximum=200.0
-    )
-    marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
-    disturbance_hold: float = option(
-        0.1,
-        "how long a message on disturbance acts unless a new one comes",
-        unit="s",
-        minimum=0.01,
-        maximum=5.0,
-    )
-    object: ShapeConfig = dataclasses.field(default_factory=ShapeConfig)
-    scene: Scene = dataclasses.field(default_factory=Scene)
-    camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
-    impedance: ImpedanceConfig = dataclasses.field(default_factory=ImpedanceConfig)
-    # A planner never plans that far ahead; whoever does has another clock, and would keep the arm to himself.
-    follower: FollowerConfig = dataclasses.field(default_factory=lambda: FollowerConfig(horizon=1.0))
-
-    def __post_init__(self) -> None:
-        validate(self)
-
-    def simulation(self) -> Simulation:
-        """The scene of this configuration, at time 0."""
-        plant = dataclasses.replace(self.scene.plant, shape=self.object.shape())
-        scene = dataclasses.replace(self.scene, plant=plant)
-        return Simulation(
-            scene, seed=self.seed, camera=self.camera, impedance=self.impedance, follower=self.follower
-        )
+CELLS: dict[str, Callable[..., DriverCell]] = {PUSHING: PushingCell, AIR_HOCKEY: AirHockeyCell}
 
 
 class FrankaDriver(ManagedNode):
@@ -112,35 +66,32 @@ class FrankaDriver(ManagedNode):
         """Build the simulation, warm it up, open the topics."""
         self.config = config
         _compile(config)
-        self.simulation = config.simulation()
+        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future]] = queue.SimpleQueue()
+        self._open_topics()
+        self.cell = CELLS[config.world](self, config)
+        self.simulation = self.cell.world
         self.pacer = Pacer(config.real_time_factor)
         self.paused = False
-        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future]] = queue.SimpleQueue()
         self._earliest = -math.inf
         self._accepted = 0
         self._advanced = Pulse()
-        self._hand: tuple[float, NDArray] | None = None
         self._measured = (time.perf_counter(), 0.0)
-        self._open_topics()
         self._tickers = {
             self._publish_joints: Ticker(config.joint_state_rate),
             self._publish_reports: Ticker(config.report_rate),
             self._publish_markers: Ticker(config.marker_rate),
         }
         self._clock_ticker = Ticker(config.clock_rate)
-        self.diagnostics = Diagnostics(self, self.report, hardware="simulated FR3", stamp=self.stamp)
+        self.diagnostics = Diagnostics(self, self.report, hardware=self.cell.hardware, stamp=self.stamp)
 
     def _open_topics(self) -> None:
         self._clock_publisher = self.advertise(Clock, "/clock", best_effort(1))
         self._joint_publisher = self.advertise(JointState, "joint_states", reliable(10))
         self._desired_publisher = self.advertise(JointState, "desired_joint_states", reliable(5))
         self._camera_publisher = self.advertise(PoseWithCovarianceStamped, "object_pose", reliable(5))
-        self._wrench_publisher = self.advertise(WrenchStamped, "external_wrench", reliable(5))
         self._object_publisher = self.advertise(Odometry, "~/ground_truth/object", best_effort(1))
-        self._tool_publisher = self.advertise(Odometry, "~/ground_truth/tool", best_effort(1))
         self._marker_publisher = self.advertise(MarkerArray, "~/markers", latched())
         self._commands = self.subscribe(JointTrajectory, "joint_trajectory", self._receive_trajectory)
-        self.subscribe(WrenchStamped, "disturbance", self._receive_disturbance)
         self.serve(Trigger, "~/reset", self._reset_requested)
         self.serve(SetBool, "~/pause", self._pause_requested)
 
@@ -152,25 +103,19 @@ class FrankaDriver(ManagedNode):
         """The present simulated time as a message."""
         return SIMULATED.stamp(self.simulation.time)
 
-    def spin(self, executor: Executor) -> None:
+    def spin(self, executor: Executor, signals: StopSignals) -> None:
         """Step the simulation while another thread executes callbacks."""
         # A callback in Python may hold the interpreter for this long; the default is the length of a slice.
         sys.setswitchinterval(1e-3)
-        failures: list[BaseException] = []
-        thread = threading.Thread(target=_spin_until_shutdown, args=(executor, failures), daemon=True)
-        thread.start()
-        try:
-            self._run(thread)
-        finally:
-            executor.shutdown(timeout_sec=2.0)
-            thread.join(timeout=2.0)
-        if failures:
-            raise failures[0]
+        with Spinning(executor) as callbacks:
+            self._run(callbacks, signals)
+        if callbacks.failure is not None:
+            raise callbacks.failure
 
-    def _run(self, callbacks: threading.Thread) -> None:
+    def _run(self, callbacks: Spinning, signals: StopSignals) -> None:
         """Advance whenever the node is active, for as long as callbacks are executed."""
         running = False
-        while rclpy.ok() and callbacks.is_alive():
+        while not signals.requested and callbacks.alive:
             if not (self.active and self.configured):
                 running = False
                 time.sleep(0.02)
@@ -195,8 +140,9 @@ class FrankaDriver(ManagedNode):
                 self.pacer.start(self.simulation.time)
                 pause, due = 0.02, None
             else:
-                self._disturb()
+                self.cell.before_slice(SLICE)
                 self.simulation.advance(SLICE)
+                self.cell.after_slice()
                 self._publish()
                 pause, due = 0.0, self.simulation.time
         if due is None:
@@ -228,23 +174,13 @@ class FrankaDriver(ManagedNode):
             except InvalidInputError as error:
                 result.set_exception(error)
 
-    def _disturb(self) -> None:
-        """Push for this slice while the last message on disturbance acts."""
-        if self._hand is None:
-            return
-        end, wrench = self._hand
-        if self.simulation.time < end - 1e-9:
-            self.simulation.push_object(wrench[:3], wrench[3:], SLICE)
-        else:
-            self._hand = None
-
     def _publish(self) -> None:
         now = self.simulation.time
         if self._clock_ticker.due(now):
             self._clock_publisher.publish(Clock(clock=self.stamp()))
-        for frame in self.simulation.camera_frames():
-            stamp, base = SIMULATED.stamp(frame.stamp), self.config.base_frame
-            self._camera_publisher.publish(observation_message(frame.pose, frame.covariance, stamp, base))
+        base = self.config.base_frame
+        for seen in self.simulation.camera_frames():
+            self._camera_publisher.publish(messages.seen_object(self.simulation, seen, base))
         for publish, ticker in self._tickers.items():
             if ticker.due(now):
                 publish()
@@ -253,17 +189,15 @@ class FrankaDriver(ManagedNode):
         self._joint_publisher.publish(messages.measured_joints(self.simulation, self.config.base_frame))
 
     def _publish_reports(self) -> None:
-        sim, frame = self.simulation, self.config.base_frame
-        self._desired_publisher.publish(messages.desired_joints(sim, frame))
-        self._wrench_publisher.publish(messages.external_wrench(sim, frame))
-        self._object_publisher.publish(messages.true_object(sim, frame))
-        for message in messages.true_tools(sim, frame):
-            self._tool_publisher.publish(message)
+        frame = self.config.base_frame
+        self._desired_publisher.publish(messages.desired_joints(self.simulation, frame))
+        self._object_publisher.publish(messages.true_object(self.simulation, frame))
+        self.cell.publish_reports()
 
     def _publish_markers(self) -> None:
-        self._marker_publisher.publish(messages.scene_markers(self.simulation, self.config.base_frame))
+        self._marker_publisher.publish(self.cell.markers())
 
-    def _ask(self, action: Callable[[], Any]) -> Future:
+    def ask(self, action: Callable[[], Any]) -> Future:
         """Let the main thread do something between two slices."""
         result: Future = Future()
         self._requests.put((action, result))
@@ -276,7 +210,7 @@ class FrankaDriver(ManagedNode):
             self.complaints.add("joint_trajectory.shape", f"trajectory refused (shape): {error}")
             return
         command = TrajectoryCommand(**vars(points))
-        self._ask(lambda: self._accept(command)).add_done_callback(self._complain)
+        self.ask(lambda: self._accept(command)).add_done_callback(self._complain)
 
     def _check_publishers(self) -> None:
         count = self.count_publishers(self._commands.topic_name)
@@ -308,38 +242,31 @@ class FrankaDriver(ManagedNode):
         elif error is not None:
             self.complaints.add("joint_trajectory", str(error))
 
-    def _receive_disturbance(self, message: WrenchStamped) -> None:
-        require_frame(message.header, self.config.base_frame)
-        force, torque = message.wrench.force, message.wrench.torque
-        wrench = np.array([force.x, force.y, force.z, torque.x, torque.y, torque.z])
-        require_finite("wrench", wrench)
-        if np.linalg.norm(wrench[:3]) > 200.0 or np.linalg.norm(wrench[3:]) > 20.0:
-            raise InvalidInputError("the wrench is beyond what a hand does: at most 200 N and 20 Nm")
-        self._ask(lambda: self._take_hand(wrench))
-
-    def _take_hand(self, wrench: NDArray) -> None:
-        self._hand = (self.simulation.time + self.config.disturbance_hold, wrench)
-
     def _reset_requested(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(self._reset, response, "object and arm are back where they started; time goes on")
+        return self.answer(self._reset, response)
 
-    def _answer(self, action: Callable[[], Any], response: Any, message: str) -> Any:
-        """Let the main thread act, and say so."""
+    def answer(self, action: Callable[[], str], response: Any) -> Any:
+        """Let the main thread act, and answer with what it says."""
         try:
-            self._ask(action).result(timeout=5.0)
-            response.success, response.message = True, message
+            response.message = self.ask(action).result(timeout=5.0)
+            response.success = True
         except FutureTimeout:
             response.success, response.message = False, "the simulation does not run; nothing happened"
+        except InvalidInputError as error:
+            response.success, response.message = False, str(error)
         return response
 
-    def _reset(self) -> None:
-        self.simulation.reset()
-        self._hand = None
+    def _reset(self) -> str:
+        words = self.cell.reset()
         self._earliest = -math.inf
+        return words
 
     def _pause_requested(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        message = "paused" if request.data else "running"
-        return self._answer(lambda: setattr(self, "paused", request.data), response, message)
+        return self.answer(lambda: self._pause(request.data), response)
+
+    def _pause(self, paused: bool) -> str:
+        self.paused = paused
+        return "paused" if paused else "running"
 
     def figures(self) -> dict[str, Any]:
         """How time passes, what was accepted, and how the limits were kept."""
@@ -350,6 +277,7 @@ class FrankaDriver(ManagedNode):
             "delayed_s": f"{self.pacer.delayed:.3f}",
             "trajectories_accepted": self._accepted,
             **messages.figures(self.simulation),
+            **self.cell.figures(),
         }
 
     def health(self) -> tuple[int, str]:
@@ -357,6 +285,9 @@ class FrankaDriver(ManagedNode):
         violations = self.simulation.limits.violations
         if violations:
             return ERROR, f"limits were broken at {violations} instants"
+        trouble = self.cell.trouble()
+        if trouble:
+            return ERROR, trouble
         level, message = super().health()
         return (level, message) if level != OK else (OK, "paused" if self.paused else "running")
 
@@ -367,13 +298,6 @@ class FrankaDriver(ManagedNode):
         return (self._measured[1] - simulated) / max(self._measured[0] - wall, 1e-9)
 
 
-def _spin_until_shutdown(executor: Executor, failures: list[BaseException]) -> None:
-    try:
-        executor.spin()
-    except BaseException as error:  # handed to the main thread, which raises it
-        failures.append(error)
-
-
 def _compile(config: FrankaDriverConfig) -> None:
     """Run a throw-away simulation, so that everything is compiled before time begins."""
     simulation = config.simulation()
@@ -382,8 +306,6 @@ def _compile(config: FrankaDriverConfig) -> None:
     command = TrajectoryCommand(names, 0.0, np.array([0.0, 0.1]), still, np.zeros_like(still))
     simulation.follower.accept(command, 0.0)
     simulation.advance(0.1)
-    simulation.tool_velocity()
-    simulation.tool_contact_force()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.arm_world import TIMESTEP
 from sim_bridge.looks import add_looks
 from sim_bridge.object_plant import ObjectPlant, solids
 from sim_bridge.robots import CUBE, KINDS, LINK, ROD, RobotKind, robot_spec
@@ -17,7 +18,6 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.robot.tool_plane import ToolPlane
 
-TIMESTEP = 0.001
 GRAVITY = 9.81
 CUBE_SIDE = 0.015
 """Of the small wooden cubes that may lie in the way [m]."""

@@ -8,31 +8,23 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.camera import Camera, CameraConfig, CameraFrame
+from sim_bridge.arm_world import TIMESTEP, ArmWorld, vector
+from sim_bridge.camera import Camera, CameraConfig
 from sim_bridge.contacts import Contacts, RobotContacts
 from sim_bridge.disturbances import Disturbances, Hand, Push
 from sim_bridge.impedance import ImpedanceConfig, ImpedanceController
-from sim_bridge.limit_monitor import LimitMonitor
-from sim_bridge.scene import TIMESTEP, Scene, build
+from sim_bridge.scene import Scene, build
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryFollower
 from vpsto_ros.exceptions import InvalidInputError
 
 _DISPLACEMENT = 0.05  # largest displacement of the object at once [m]
 
 
-class Simulation:
-    """A scene that is stepped in lock-step or by a driver.
+class Simulation(ArmWorld):
+    """A robot that pushes an object on a table, stepped in lock-step or by a driver.
 
     Attributes:
-        scene: what was built.
-        model: the MuJoCo model, for renderers and inspection.
-        data: the MuJoCo data.
-        robot: the model that controllers and planners use.
         plane: the plane of the robot's tools at the scene's height.
-        follower: takes trajectories: ``simulation.follower.accept(command, simulation.time)``.
-        controller: the impedance controller.
-        camera: the camera.
-        limits: counts what breaks the arms' limits.
         tool_height_deviation: largest distance of a tip from the scene's height so far [m].
     """
 
@@ -58,10 +50,9 @@ class Simulation:
             ConfigurationError: the scene does not fit the arm.
         """
         self.scene = scene or Scene()
-        self.model = build(self.scene)
-        self.data = mujoco.MjData(self.model)
         kind = self.scene.kind
-        self.robot, self.plane = kind.load(), self.scene.plane()
+        super().__init__(build(self.scene), kind.load())
+        self.plane = self.scene.plane()
         start = self.scene.joints()
         nominal = self.plane.joints([kind.nominal])[0]
         self.follower = TrajectoryFollower(self.robot.limits, self.robot.joint_names, start, follower)
@@ -69,44 +60,22 @@ class Simulation:
             self.robot, nominal, impedance, round_tool=kind.round_tool, period=TIMESTEP
         )
         self.camera = Camera(camera or CameraConfig(), np.random.default_rng(seed))
-        self.limits = LimitMonitor(self.robot.limits)
         self.tool_height_deviation = 0.0
-        self._steps = 0
         self._disturbances = Disturbances(self.model, self.data, self.scene.plant)
         self._contacts = Contacts(self.model, self.data, kind)
         self._bind()
         self.reset()
 
     def _bind(self) -> None:
-        """Views into MuJoCo's state, taken once: they stay valid as long as the data lives."""
+        """More views into MuJoCo's state."""
         d, n = self.data, self.robot.dof
-        self._q, self._qd = d.qpos[:n], d.qvel[:n]
         self._object_q, self._object_qd = d.qpos[n : n + 7], d.qvel[n : n + 6]
-        self._ctrl = d.ctrl
         self._object_com = d.xipos[self.model.body("object").id]
         names = [f"{arm.prefix}tool_tip" for arm in self.scene.kind.arms]
         self._tips = [d.site_xpos[self.model.site(name).id] for name in names]
 
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self._steps * TIMESTEP
-
-    @property
-    def steps(self) -> int:
-        """Steps of the physics so far."""
-        return self._steps
-
-    def step(self) -> None:
-        """Advance by one millisecond."""
-        model, data, now = self.model, self.data, self._steps * TIMESTEP
-        # Forward quantities belong to the state before mj_step; splitting it gives the controller the
-        # present ones.
-        mujoco.mj_step1(model, data)
-        q_des, qd_des, qdd_des = self.follower.reference(now)
-        controller = self.controller
-        self._ctrl[:] = controller.torque(self._q, self._qd, q_des, qd_des, qdd_des)
-        self.limits.observe(q_des, qd_des, qdd_des, self._q, self._qd, controller.demand)
+    def _act(self, now: float) -> None:
+        """Watch tips and contacts, and let hands push."""
         for tip in self._tips:
             deviation = abs(tip[2] - self.plane.height)
             if deviation > self.tool_height_deviation:
@@ -114,30 +83,6 @@ class Simulation:
         self._contacts.count()
         if self._disturbances.active:
             self._disturbances.apply(now)
-        if now >= self.camera.next_capture:
-            self.camera.capture(now, self.object_pose())
-        mujoco.mj_step2(model, data)
-        self._steps += 1
-
-    def advance(self, duration: float) -> None:
-        """Advance by a duration [s], rounded to milliseconds."""
-        for _ in range(round(duration / TIMESTEP)):
-            self.step()
-
-    @property
-    def joint_position(self) -> NDArray[np.float64]:
-        """Measured joint positions [rad], shape (n,)."""
-        return self._q.copy()
-
-    @property
-    def joint_velocity(self) -> NDArray[np.float64]:
-        """Measured joint velocities [rad/s], shape (n,)."""
-        return self._qd.copy()
-
-    @property
-    def joint_torque(self) -> NDArray[np.float64]:
-        """Torques of the last control cycle [Nm], shape (n,)."""
-        return self._ctrl.copy()
 
     def tool_position(self, tool: int = 0) -> NDArray[np.float64]:
         """True position of a tool's tip in the base frame [m], shape (3,); tools count from 0."""
@@ -176,10 +121,6 @@ class Simulation:
         """True velocity of the object's frame, (vx, vy, yaw rate) [m/s, rad/s] in the base frame."""
         return self._object_qd[[0, 1, 5]]
 
-    def camera_frames(self) -> list[CameraFrame]:
-        """What the camera has delivered since the last call."""
-        return self.camera.poll(self.time)
-
     def tool_contact_force(self, tool: int | None = None) -> NDArray[np.float64]:
         """Force on the object during the last step [N], base frame, shape (3,): of one tool, or of all."""
         tools = range(len(self._tips)) if tool is None else [tool]
@@ -201,7 +142,7 @@ class Simulation:
         Raises:
             InvalidInputError: force or torque is not three finite numbers, or the duration is not positive.
         """
-        wrench = np.concatenate([_vector(force, "force", 3), _vector(torque, "torque", 3)])
+        wrench = np.concatenate([vector(force, "force", 3), vector(torque, "torque", 3)])
         self._disturbances.active.append(Push(self.time + _positive(duration, "duration"), wrench))
 
     def knock(self, displacement: ArrayLike, duration: float = 0.25) -> None:
@@ -214,7 +155,7 @@ class Simulation:
             InvalidInputError: the displacement is not two finite numbers, or the duration is not positive.
         """
         origin = self._object_com[:2].copy()
-        move = _vector(displacement, "displacement", 2)
+        move = vector(displacement, "displacement", 2)
         self._disturbances.active.append(Hand(self.time, _positive(duration, "duration"), origin, move))
 
     def displace_object(self, dx: float, dy: float) -> None:
@@ -227,7 +168,7 @@ class Simulation:
         Raises:
             InvalidInputError: dx or dy is not a finite number, or larger.
         """
-        move = _vector([dx, dy], "displacement", 2)
+        move = vector([dx, dy], "displacement", 2)
         if np.abs(move).max() > _DISPLACEMENT:
             raise InvalidInputError(f"the object is displaced by at most {_DISPLACEMENT} m, got ({dx}, {dy})")
         self.place_object(self._object_q[:2] + move)
@@ -239,7 +180,7 @@ class Simulation:
             InvalidInputError: the position is not two finite numbers.
         """
         yaw = self.object_pose()[2]
-        self._object_q[:2] = _vector(position, "position", 2)
+        self._object_q[:2] = vector(position, "position", 2)
         self._object_q[2:] = (0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
         self._object_qd[:] = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -256,30 +197,18 @@ class Simulation:
         Raises:
             InvalidInputError: a wrong shape, or joints beyond their limits.
         """
-        x, y, yaw = _vector(self.scene.object_pose if object_pose is None else object_pose, "object_pose", 3)
-        q = _vector(self.scene.joints() if joints is None else joints, "joints", self.robot.dof)
-        lower, upper = self.robot.position_range
-        if np.any(q < lower) or np.any(q > upper):
-            raise InvalidInputError(f"joints {np.round(q, 3).tolist()} are beyond their position limits")
+        x, y, yaw = vector(self.scene.object_pose if object_pose is None else object_pose, "object_pose", 3)
+        q = vector(self.scene.joints() if joints is None else joints, "joints", self.robot.dof)
+        self._check_joints(q)
         data = self.data
         data.qpos[:] = self.model.qpos0  # cubes go back, too
         data.qvel[:] = 0.0
         data.qacc_warmstart[:] = 0.0
         data.xfrc_applied[:] = 0.0
-        self._q[:] = q
         self._object_q[:] = (x, y, 0.0, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
         self._disturbances.active.clear()
-        self.camera.clear()
-        self.controller.reset()
-        self.follower.hold(q, self.time)
+        self._hold(q)
         mujoco.mj_forward(self.model, data)
-
-
-def _vector(values: ArrayLike, name: str, size: int) -> NDArray[np.float64]:
-    vector = np.array(values, dtype=float)
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise InvalidInputError(f"{name} must be {size} finite numbers, got {values!r}")
-    return vector
 
 
 def _positive(value: float, name: str) -> float:

@@ -19,7 +19,7 @@ from rclpy.serialization import serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sim_bridge.demo.bimanual_push import DEMO as BIMANUAL_PUSH
-from sim_bridge.demo.observer import GOAL_REPEAT, Observer, Spinning, moves
+from sim_bridge.demo.observer import GOAL_REPEAT, NodeThread, Observer, moves
 from sim_bridge.demo.processes import ProcessGroup
 from sim_bridge.demo.push_box import DEMO as PUSH_BOX
 from sim_bridge.demo.push_box import box_scenario
@@ -108,7 +108,7 @@ def test_a_failing_callback_ends_the_watch_with_its_error(observer, tmp_path):
 
     observer.create_timer(0.01, fail)
     began = time.monotonic()
-    with Spinning(observer) as spinning, ProcessGroup(tmp_path, {}) as processes:
+    with NodeThread(observer) as spinning, ProcessGroup(tmp_path, {}) as processes:
         arguments = (box_scenario(np.random.default_rng(0)), lambda _: None, time.monotonic() + 60.0)
         with pytest.raises(VpstoError, match=r"own node failed: OSError: no space left") as caught:
             _watch(observer, spinning, processes, *arguments)

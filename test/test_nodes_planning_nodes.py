@@ -494,7 +494,7 @@ def test_a_contact_planner_refuses_the_future_too(bench):
         made.send(topic, message)
     made.advance(0.05)
     assert made.node.complaints.counts["joint_states"] == made.node.complaints.counts["object_state"] == 1
-    assert made.node.tool is None and made.node.task.object is None
+    assert made.node.joints is None and made.node.task.object is None
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from sim_bridge.hockey.world import AirHockeyWorld, ArmGains
 from sim_bridge.trajectory_follower import TrajectoryCommand
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.robot.iiwa import JOINT_NAMES, MODEL_PATH, iiwa14
+from vpsto_ros.trajectory import OptimalBasis, synthesize
 
 Q0 = np.array(START_JOINTS)
 TOUCHING = table.PUCK_RADIUS + table.MALLET_RADIUS
@@ -438,3 +439,30 @@ def test_misuse_of_reset_is_named_and_changes_nothing(misuse, message):
         world.reset(**misuse)
     np.testing.assert_array_equal(world.joint_position, Q0)
     np.testing.assert_allclose(world.puck_pose(), [1.0, 0.0, 0.0])
+
+
+def test_a_puck_put_back_by_a_hand_leaves_the_arm_alone(shared):
+    shared.reset()
+    q = shared.joint_position
+    keys = np.stack([q, q + 0.2 * np.eye(7)[0]])
+    motion = synthesize(
+        OptimalBasis.uniform(0), keys, np.zeros(7), np.zeros(7), shared.robot.limits, start_time=shared.time
+    )
+    shared.follower.accept(TrajectoryCommand.of(motion, JOINT_NAMES), shared.time)
+    shared.advance(0.1)
+    before = shared.joint_velocity
+    shared.place_puck((1.1, 0.2, 0.0), (0.05, -0.02, 0.0))
+    np.testing.assert_array_equal(shared.joint_velocity, before)
+    np.testing.assert_allclose(shared.puck_pose(), [1.1, 0.2, 0.0], atol=1e-12)
+    np.testing.assert_allclose(shared.object_twist(), [0.05, -0.02, 0.0])
+    shared.advance(motion.duration)
+    np.testing.assert_allclose(shared.joint_position, keys[1], atol=5e-3)
+
+
+def test_a_puck_cannot_be_put_under_the_mallet_where_that_is_now(shared):
+    shared.reset()
+    mallet = shared.mallet_state().position
+    for place, message in (((*mallet[:2], 0.0), "under the mallet"), ((3.0, 0.0, 0.0), "not on the table")):
+        with pytest.raises(InvalidInputError, match=message):
+            shared.place_puck(place)
+    np.testing.assert_allclose(shared.puck_pose(), [1.0, 0.0, 0.0], atol=1e-12)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
-import threading
 
 import numpy as np
 
@@ -48,6 +47,7 @@ def driver_node(cores: Cores) -> Action:
 
     from sim_bridge.demo.processes import private_network
     from sim_bridge.franka_driver import SLICE, FrankaDriver
+    from sim_bridge.spinning import Spinning
 
     rclpy.init(domain_id=int(private_network()["ROS_DOMAIN_ID"]))
     cores.cleanup.callback(rclpy.try_shutdown)
@@ -55,11 +55,9 @@ def driver_node(cores: Cores) -> Action:
     cores.cleanup.callback(node.destroy_node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    cores.cleanup.callback(thread.join, timeout=2.0)
     cores.cleanup.callback(executor.shutdown, timeout_sec=2.0)
     node.start()
-    thread.start()
+    cores.cleanup.enter_context(Spinning(executor))
 
     def second() -> None:
         for _ in range(round(1.0 / SLICE)):

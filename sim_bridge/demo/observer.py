@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -29,6 +28,7 @@ from sim_bridge.demo.scenario import Orders, Scenario
 from sim_bridge.report.bag import BagRecorder
 from sim_bridge.report.overlay import MARKERS, Overlay, overlays_of
 from sim_bridge.report.recording import GOAL_POSE, GROUND_TRUTH, JOINT_STATES, JOINT_TRAJECTORY, planar
+from sim_bridge.spinning import Spinning
 from vpsto_ros.exceptions import VpstoError
 from vpsto_ros.robot.tool_plane import ToolPlane
 
@@ -228,21 +228,14 @@ class Activity:
         return not self.waiting
 
 
-class Spinning:
+class NodeThread(Spinning):
     """Runs a node's callbacks in a thread while a block is executed."""
 
     def __init__(self, node: Node) -> None:
         """Prepare to spin this node."""
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(node)
-        self._thread = threading.Thread(target=self._spin, name="ros", daemon=True)
-        self.failure: BaseException | None = None
-
-    def _spin(self) -> None:
-        try:
-            self._executor.spin()
-        except BaseException as error:  # handed to the main thread by `check`
-            self.failure = error
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        super().__init__(executor)
 
     def check(self) -> None:
         """Whoever waits for what the callbacks do has to ask this again and again.
@@ -254,13 +247,9 @@ class Spinning:
             kind = type(self.failure).__name__
             raise VpstoError(f"the demo's own node failed: {kind}: {self.failure}") from self.failure
 
-    def __enter__(self) -> Spinning:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *arguments: Any) -> None:
+        super().__exit__(*arguments)
         self._executor.shutdown(timeout_sec=5.0)
-        self._thread.join(timeout=5.0)
 
 
 def _quality(topic: str) -> QoSProfile:

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from sim_bridge.demo.artifacts import write_artifacts
 from sim_bridge.demo.live_view import live_view
-from sim_bridge.demo.observer import Activity, Observer, Spinning
+from sim_bridge.demo.observer import Activity, NodeThread, Observer
 from sim_bridge.demo.processes import ProcessGroup, private_network
 from sim_bridge.demo.scenario import Phase, Scenario
 from sim_bridge.demo.settings import Settings
@@ -132,19 +132,19 @@ def _trouble(processes: ProcessGroup, ended: Collection[str]) -> list[str]:
 @contextlib.contextmanager
 def _observer(
     bag: BagRecorder, scenario: Scenario, tools: ToolPlane, environment: dict[str, str]
-) -> Iterator[tuple[Observer, Spinning]]:
+) -> Iterator[tuple[Observer, NodeThread]]:
     # Signals are ours: Ctrl-C must reach the code that stops the processes.
     rclpy.init(domain_id=int(environment["ROS_DOMAIN_ID"]), signal_handler_options=SignalHandlerOptions.NO)
     observer = Observer(bag, scenario, tools)
     try:
-        with Spinning(observer) as spinning:
+        with NodeThread(observer) as spinning:
             yield observer, spinning
     finally:
         observer.destroy_node()
         rclpy.try_shutdown()
 
 
-def _wait_until_active(observer: Observer, spinning: Spinning, processes: ProcessGroup) -> None:
+def _wait_until_active(observer: Observer, spinning: NodeThread, processes: ProcessGroup) -> None:
     print("starting the nodes; the first time they compile for half a minute ...", flush=True)
     activity = Activity(observer, tuple(NODES))
     deadline = time.monotonic() + START_PATIENCE
@@ -177,7 +177,7 @@ def _await_reports(observer: Observer, scenario: Scenario) -> None:
 
 def _watch(
     observer: Observer,
-    spinning: Spinning,
+    spinning: NodeThread,
     processes: ProcessGroup,
     scenario: Scenario,
     show: Any,

@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_bridge.camera import Camera, CameraConfig, CameraFrame
+from sim_bridge.arm_world import TIMESTEP, ArmWorld, vector
+from sim_bridge.camera import Camera, CameraConfig
 from sim_bridge.hockey import table
 from sim_bridge.hockey.contact_log import ContactLog, PuckContact
 from sim_bridge.hockey.mallet import Mallet, MalletConfig, MalletState
-from sim_bridge.hockey.scene import TIMESTEP, AirHockeyScene, build
+from sim_bridge.hockey.rules import RulesMonitor
+from sim_bridge.hockey.scene import AirHockeyScene, build
 from sim_bridge.impedance import JointController
-from sim_bridge.limit_monitor import LimitMonitor
 from sim_bridge.trajectory_follower import FollowerConfig, TrajectoryFollower
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
@@ -62,22 +63,17 @@ class Goal:
     velocity: NDArray[np.float64]
 
 
-class AirHockeyWorld:
+class AirHockeyWorld(ArmWorld):
     """Table, puck, mallet and arm, stepped in lock-step or by a driver.
 
+    The tip of the robot is the universal joint.
+
     Attributes:
-        scene: what was built.
-        model: the MuJoCo model, for renderers and inspection.
-        data: the MuJoCo data.
-        robot: the arm's model for controllers and planners; its tip is the universal joint.
-        follower: takes trajectories: ``world.follower.accept(command, world.time)``.
-        controller: the arm's joint controller.
-        camera: the camera.
-        limits: counts what breaks the arm's limits.
-        height_deviation: largest distance of the universal joint from the height of play since the last
-            reset [m].
-        goal: where the puck went out of play, or None; stays until the next reset.
+        rules: counts what breaks the rules of play, since the last reset.
+        goal: where the puck went out of play, or None; stays until the puck is put back.
     """
+
+    surface = table.TABLE_ORIGIN[2]
 
     def __init__(
         self,
@@ -103,90 +99,47 @@ class AirHockeyWorld:
             InvalidInputError: the scene's starts are out of range; see :meth:`reset`.
         """
         self.scene = scene or AirHockeyScene()
-        self.model = build(self.scene)
-        self.data = mujoco.MjData(self.model)
-        self.robot = iiwa14()
+        super().__init__(build(self.scene), iiwa14())
         start, gains = np.array(self.scene.joints), gains or ArmGains()
         self.follower = TrajectoryFollower(self.robot.limits, self.robot.joint_names, start, follower)
         self.controller = JointController(
             self.robot, gains.stiffness, np.diag(gains.damping), period=TIMESTEP, implicit=True
         )
         self.camera = Camera(camera, np.random.default_rng(seed))
-        self.limits = LimitMonitor(self.robot.limits)
+        self.rules = RulesMonitor(self.robot.limits)
         self.goal: Goal | None = None
-        self.height_deviation = 0.0
-        self._steps = 0
         self._mallet = Mallet(self.model, self.data, mallet)
         self._log = ContactLog(self.model, self.data)
         self._bind()
         self.reset()
 
     def _bind(self) -> None:
-        """Views into MuJoCo's state, taken once: they stay valid as long as the data lives."""
-        d, n = self.data, self.robot.dof
-        self._q, self._qd, self._ctrl = d.qpos[:n], d.qvel[:n], d.ctrl[:n]
+        """More views into MuJoCo's state."""
+        d = self.data
         puck = self.model.joint("puck_x")
         # The puck's joints count from the table's centre.
         self._puck_q = d.qpos[puck.qposadr[0] :][:3]
         self._puck_qd = d.qvel[puck.dofadr[0] :][:3]
         self._puck_origin = np.array([*table.TABLE_ORIGIN[:2], 0.0])
-        self._joint_position = d.site_xpos[self.model.site(UNIVERSAL_JOINT).id]
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self._steps * TIMESTEP
-
-    @property
-    def steps(self) -> int:
-        """Steps of the physics so far."""
-        return self._steps
+        self._joint = d.site_xpos[self.model.site(UNIVERSAL_JOINT).id]
+        self._elbow, self._wrist = (d.xpos[self.model.body(f"iiwa_link_{i}").id] for i in (4, 6))
 
     def step(self) -> None:
         """Advance by one millisecond."""
-        model, data, now = self.model, self.data, self._steps * TIMESTEP
-        # Forward quantities belong to the state before mj_step; splitting it gives the controllers the
-        # present ones.
-        mujoco.mj_step1(model, data)
-        q_des, qd_des, qdd_des = self.follower.reference(now)
-        self._ctrl[:] = self.controller.torque(self._q, self._qd, q_des, qd_des, qdd_des)
-        self._mallet.control()
-        self.limits.observe(q_des, qd_des, qdd_des, self._q, self._qd, self.controller.demand)
-        deviation = abs(float(self._joint_position[2]) - table.UNIVERSAL_JOINT_HEIGHT)
-        self.height_deviation = max(self.height_deviation, deviation)
-        pose = self.puck_pose()
-        self._log.observe(now, pose, self._puck_qd, self._mallet.state)
-        if now >= self.camera.next_capture:
-            self.camera.capture(now, pose)
-        mujoco.mj_step2(model, data)
-        self._steps += 1
+        super().step()
         self._watch_goals()
 
-    def advance(self, duration: float) -> None:
-        """Advance by a duration [s], rounded to milliseconds."""
-        for _ in range(round(duration / TIMESTEP)):
-            self.step()
+    def _act(self, now: float) -> None:
+        """Hold the mallet, and watch rules and contacts."""
+        self._mallet.control()
+        self.rules.observe(self._joint, self._elbow, self._wrist, self._q, self._qd)
+        self._log.observe(now, self.puck_pose(), self._puck_qd, self._mallet.state)
 
     def _watch_goals(self) -> None:
         position = self._puck_q[:2] + self._puck_origin[:2]
         end = table.goal_at(position) if self.goal is None else None
         if end is not None:
             self.goal = Goal(end, self.time, position, self._puck_qd[:2].copy())
-
-    @property
-    def joint_position(self) -> NDArray[np.float64]:
-        """Measured joint positions [rad], shape (7,)."""
-        return self._q.copy()
-
-    @property
-    def joint_velocity(self) -> NDArray[np.float64]:
-        """Measured joint velocities [rad/s], shape (7,)."""
-        return self._qd.copy()
-
-    @property
-    def joint_torque(self) -> NDArray[np.float64]:
-        """Torques of the last control cycle [Nm], shape (7,)."""
-        return self._ctrl.copy()
 
     def puck_pose(self) -> NDArray[np.float64]:
         """True pose of the puck (x, y, yaw) [m, rad], shape (3,), base frame; the yaw counts turns."""
@@ -195,6 +148,24 @@ class AirHockeyWorld:
     def puck_twist(self) -> NDArray[np.float64]:
         """True velocity of the puck (vx, vy, yaw rate) [m/s, rad/s], shape (3,), base frame."""
         return self._puck_qd.copy()
+
+    def object_pose(self) -> NDArray[np.float64]:
+        """True pose of the puck."""
+        return self.puck_pose()
+
+    def object_twist(self) -> NDArray[np.float64]:
+        """True velocity of the puck."""
+        return self.puck_twist()
+
+    def arm_points(self) -> list[NDArray[np.float64]]:
+        """The arm from its base to the universal joint, as of the last step's beginning."""
+        links = [self.data.body(f"iiwa_link_{i}").xpos for i in range(8)]
+        return [np.array([*links, self._joint])]
+
+    @property
+    def height_deviation(self) -> float:
+        """Largest distance of the universal joint from the height of play since the last reset [m]."""
+        return self.rules.report().height.worst
 
     def mallet_state(self) -> MalletState:
         """The mallet now."""
@@ -219,9 +190,27 @@ class AirHockeyWorld:
         """Whether the puck is outside the rims, in a goal or through a rim."""
         return not table.on_table(self.puck_pose()[:2])
 
-    def camera_frames(self) -> list[CameraFrame]:
-        """What the camera has delivered since the last call."""
-        return self.camera.poll(self.time)
+    def place_puck(self, pose: ArrayLike, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        """Put the puck somewhere at once, as a hand does that brings it back; the arm goes on.
+
+        Args:
+            pose: (x, y, yaw) [m, rad], base frame.
+            velocity: (vx, vy, yaw rate) [m/s, rad/s].
+
+        Raises:
+            InvalidInputError: a wrong shape, or a puck that is not on the table or is under the mallet.
+        """
+        pose, twist = vector(pose, "puck", 3), vector(velocity, "puck_velocity", 3)
+        _check_on_table(pose)
+        _check_clear(self.mallet_state().position, pose)
+        self._put(pose, twist)
+        mujoco.mj_forward(self.model, self.data)
+
+    def _put(self, pose: NDArray, twist: NDArray) -> None:
+        self._puck_q[:], self._puck_qd[:] = pose - self._puck_origin, twist
+        self.goal = None
+        self._log.clear()
+        self.camera.clear()
 
     def reset(
         self,
@@ -242,40 +231,36 @@ class AirHockeyWorld:
             InvalidInputError: a wrong shape, joints beyond their limits, a rod that points upwards, or a puck
                 that is not on the table or is under the mallet.
         """
-        pose = _vector(self.scene.puck if puck is None else puck, "puck", 3)
-        twist = _vector(puck_velocity, "puck_velocity", 3)
-        q = _vector(self.scene.joints if joints is None else joints, "joints", self.robot.dof)
+        pose = vector(self.scene.puck if puck is None else puck, "puck", 3)
+        twist = vector(puck_velocity, "puck_velocity", 3)
+        q = vector(self.scene.joints if joints is None else joints, "joints", self.robot.dof)
         self._check_joints(q)
         _check_on_table(pose)
         self._check_mallet(q, pose)
         data = self.data
         data.qvel[:] = data.qacc_warmstart[:] = 0.0
-        self._q[:], self._puck_q[:], self._puck_qd[:] = q, pose - self._puck_origin, twist
+        self._hold(q)
+        self._put(pose, twist)
         mujoco.mj_kinematics(self.model, data)
         self._mallet.hang()
-        self.goal, self.height_deviation = None, 0.0
-        self._log.clear()
-        self.camera.clear()
-        self.controller.reset()
-        self.follower.hold(q, self.time)
+        self.rules.reset()
         mujoco.mj_forward(self.model, data)
-
-    def _check_joints(self, q: NDArray) -> None:
-        lower, upper = self.robot.position_range
-        if np.any(q < lower) or np.any(q > upper):
-            raise InvalidInputError(f"joints {np.round(q, 3).tolist()} are beyond their position limits")
 
     def _check_mallet(self, q: NDArray, pose: NDArray) -> None:
         """The mallet must be able to hang vertically, and not on the puck."""
         joint, rod = self.robot.forward(q)
         if rod[2, 2] >= 0.0:
             raise InvalidInputError("the rod points upwards; the mallet's joint turns by 90 degrees at most")
-        distance, least = float(np.linalg.norm(joint[:2] - pose[:2])), table.PUCK_RADIUS + table.MALLET_RADIUS
-        if distance < least:
-            raise InvalidInputError(
-                f"puck = ({pose[0]:.4g}, {pose[1]:.4g}) is under the mallet; their centres must be "
-                f"{least:.4f} m apart, and are {distance:.4f} m"
-            )
+        _check_clear(joint, pose)
+
+
+def _check_clear(mallet: NDArray, pose: NDArray) -> None:
+    distance, least = float(np.linalg.norm(mallet[:2] - pose[:2])), table.PUCK_RADIUS + table.MALLET_RADIUS
+    if distance < least:
+        raise InvalidInputError(
+            f"puck = ({pose[0]:.4g}, {pose[1]:.4g}) is under the mallet; their centres must be {least:.4f} m "
+            f"apart, and are {distance:.4f} m"
+        )
 
 
 def _check_on_table(pose: NDArray) -> None:
@@ -286,10 +271,3 @@ def _check_on_table(pose: NDArray) -> None:
             f"puck = ({pose[0]:.4g}, {pose[1]:.4g}) is not on the table; its rim must be within x from "
             f"{low[0]:.3f} to {high[0]:.3f} m, y from {low[1]:.3f} to {high[1]:.3f} m of the base frame"
         )
-
-
-def _vector(values: ArrayLike, name: str, size: int) -> NDArray[np.float64]:
-    vector = np.array(values, dtype=float)
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise InvalidInputError(f"{name} must be {size} finite numbers, got {values!r}")
-    return vector

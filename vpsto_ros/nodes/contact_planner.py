@@ -1,9 +1,11 @@
 """The node that says where to touch the object next: object and goal_pose in, contact_plan out."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
@@ -13,21 +15,23 @@ from vpsto_ros.nodes.contact_tasks import ContactTask, PushingContacts, RobustPu
 from vpsto_ros.nodes.diagnostics import OK, STALE, Diagnostics, Durations, Rate, Report
 from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode, latched, run
-from vpsto_ros.nodes.robots import PUSHING, ROBUST_PUSHING
+from vpsto_ros.nodes.robots import PUSHING, ROBUST_PUSHING, SHOOTING
+from vpsto_ros.nodes.shooting_task import ShootingContacts
 
-KINDS = {PUSHING: PushingContacts, ROBUST_PUSHING: RobustPushingContacts}
+KINDS: dict[str, Callable[..., ContactTask]] = {
+    PUSHING: PushingContacts, ROBUST_PUSHING: RobustPushingContacts, SHOOTING: ShootingContacts,
+}  # fmt: skip
 
 
 class ContactPlannerNode(ManagedNode):
-    """Plans where to touch, whenever tools, object and goal are known."""
+    """Plans where to touch, whenever the robot, the object and, where there is one, the goal are known."""
 
     default_config = ContactPlannerNodeConfig()
 
     def configure(self, config: ContactPlannerNodeConfig) -> None:
         """Set up planner, topics and timer."""
         self.config = config
-        self.tools = config.robot.plane()
-        self.task: ContactTask = KINDS[config.kind](self, config)
+        self.task = KINDS[config.kind](self, config)
         self.on_time_reset()
         self._compute, self._rate, self._status = Durations(), Rate(), Report(STALE, "waiting")
         # Every end effector's last plan reaches those who join later.
@@ -41,8 +45,8 @@ class ContactPlannerNode(ManagedNode):
 
     def on_time_reset(self) -> None:
         """Forget what carries a time; the goal stays."""
-        self.tool = None
-        self.tool_stamp = -math.inf
+        self.joints: NDArray | None = None
+        self.joint_stamp = -math.inf
         self.task.forget()
 
     def cleanup(self) -> None:
@@ -57,11 +61,11 @@ class ContactPlannerNode(ManagedNode):
             self._status = Report(STALE, missing)
             return
         with self._compute.measured():
-            messages = self.task.plan(now, self.tool)
+            messages = self.task.plan(now, self.joints)
         for message in messages:
             self._publisher.publish(message)
         self._rate.tick()
-        self._status = Report()
+        self._status = Report(OK, self.task.status() or "ok")
 
     def figures(self) -> dict[str, Any]:
         """Rate and compute time."""
@@ -71,28 +75,29 @@ class ContactPlannerNode(ManagedNode):
         """Whether it plans."""
         status = self._status
         if status.level == OK:
-            return super().health()
+            level, message = super().health()
+            return (level, status.message) if level == OK else (level, message)
         trouble = self.complaints.recent()
         return status.level, f"{status.message}; {trouble}" if trouble else status.message
 
     def _missing(self, now: float) -> str:
         """What keeps the node from planning, empty if nothing does."""
         limit = self.config.input_timeout
-        if self.tool is None or now - self.tool_stamp > limit:
+        if self.joints is None or now - self.joint_stamp > limit:
             return f"no joint_states within {limit} s"
         return self.task.missing(now, limit)
 
     def _publish_markers(self) -> None:
-        make = markers.MarkerFactory(self.config.base_frame, self.get_clock().now().to_msg())
+        stamp = self.get_clock().now().to_msg()
+        make = markers.MarkerFactory(self.config.base_frame, stamp, self.task.surface)
         drawn = self.task.markers(make)
         if drawn:
             self._marker_publisher.publish(MarkerArray(markers=drawn))
 
     def _receive_joints(self, message: JointState) -> None:
         stamp = self.seconds(message.header.stamp)
-        position, _ = read_joint_state(message, self.tools.robot.joint_names)
-        self.tool = self.tools.tool(position)
-        self.tool_stamp = stamp
+        self.joints, _ = read_joint_state(message, self.task.joint_names)
+        self.joint_stamp = stamp
 
 
 def main(args: list[str] | None = None) -> int:

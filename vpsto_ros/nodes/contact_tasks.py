@@ -25,24 +25,55 @@ from vpsto_ros.planning.goal import PlanarGoal
 class ContactTask(Protocol):
     """Inputs of one kind of contact planner, and its plans as messages."""
 
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the robot's joints."""
+
+    @property
+    def surface(self) -> float:
+        """Height of the table, on which is drawn, base frame [m]."""
+
     def forget(self) -> None:
         """Forget what carries a time; the goal stays."""
 
     def missing(self, now: float, limit: float) -> str:
         """What keeps it from planning, empty if nothing does; inputs older than a limit [s] do not count."""
 
-    def plan(self, now: float, tool: NDArray) -> list[Odometry]:
-        """Where each end effector shall touch, given their plane coordinates (m,)."""
+    def plan(self, now: float, joints: NDArray) -> list[Odometry]:
+        """Where each end effector shall touch, given the robot's joint positions (n,) [rad]."""
+
+    def status(self) -> str:
+        """What the last plan is, in words; empty where there is nothing to say."""
 
     def markers(self, make: markers.MarkerFactory) -> list[Marker]:
         """The last plan, empty before the first."""
 
 
-class PushingContacts:
+class OnTable:
+    """What tasks with tools above a table at the robot's foot share."""
+
+    surface = 0.0
+
+    def __init__(self, config: ContactPlannerNodeConfig) -> None:
+        """Find the tools."""
+        self._tools = config.robot.plane()
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the robot's joints."""
+        return self._tools.robot.joint_names
+
+    def status(self) -> str:
+        """Nothing to say."""
+        return ""
+
+
+class PushingContacts(OnTable):
     """The rod and an object of which object_state says where it is."""
 
     def __init__(self, node: ManagedNode, config: ContactPlannerNodeConfig) -> None:
         """Set up the planner and listen."""
+        super().__init__(config)
         self._node, self._config = node, config
         self.planner = PushContactPlanner(config.planner, config.model.model())
         self._warm_up()
@@ -64,8 +95,9 @@ class PushingContacts:
             return f"no object_state within {limit} s"
         return "no goal_pose yet" if self.goal.latest is None else ""
 
-    def plan(self, now: float, tool: NDArray) -> list[Odometry]:
+    def plan(self, now: float, joints: NDArray) -> list[Odometry]:
         """Where the rod shall touch."""
+        tool = self._tools.tool(joints)
         self._last = plan = self.planner.plan(now, tool, self.object, self.goal.latest)
         frame, tool_frame = self._config.base_frame, self._config.tool_frame
         return [contact_message(plan, self._node.time_base, frame, tool_frame)]
@@ -90,11 +122,12 @@ class PushingContacts:
         self.planner.plan(0.0, np.array([0.4, -0.2]), state, PlanarGoal(np.array([0.55, 0.1])))
 
 
-class RobustPushingContacts:
+class RobustPushingContacts(OnTable):
     """All tools of a robot and hypotheses about an object, eq. (6.38)."""
 
     def __init__(self, node: ManagedNode, config: ContactPlannerNodeConfig) -> None:
         """Set up the planner and listen."""
+        super().__init__(config)
         self._node, self._config = node, config
         planning, robust, frame = config.robust.planning, config.robust, config.base_frame
         rule = contact_rule(config.robot, config.model, planning)
@@ -117,8 +150,9 @@ class RobustPushingContacts:
             return f"no object_belief within {limit} s"
         return "no goal_pose yet" if self.goal.latest is None else ""
 
-    def plan(self, now: float, tool: NDArray) -> list[Odometry]:
+    def plan(self, now: float, joints: NDArray) -> list[Odometry]:
         """Where each end effector shall touch."""
+        tool = self._tools.tool(joints)
         known, target = self.belief.latest, self.goal.target
         assert known is not None and target is not None, "`missing` says so"
         self._last = plan = self.planner.plan(now, tool, known.belief, target)

@@ -128,11 +128,11 @@ def goal_message(goal: PlanarGoal, stamp: Time, frame: str) -> PoseStamped:
 
 
 def observation_message(
-    pose: NDArray, covariance: NDArray, stamp: Time, frame: str
+    pose: NDArray, covariance: NDArray, stamp: Time, frame: str, height: float = 0.0
 ) -> PoseWithCovarianceStamped:
-    """A measured planar pose (3,) and its covariance (3, 3) over (x, y, yaw)."""
+    """A measured planar pose (3,) at a height [m] and its covariance (3, 3) over (x, y, yaw)."""
     message = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=frame))
-    message.pose.pose = planar_pose(pose)
+    message.pose.pose = planar_pose(pose, height)
     message.pose.covariance = spread_covariance(covariance)
     return message
 
@@ -156,18 +156,18 @@ def read_observation(message: PoseWithCovarianceStamped, frame: str) -> tuple[Po
 
 
 def state_message(
-    state: ObjectState, time_base: TimeBase, frame: str, child_frame: str = "object"
+    state: ObjectState, time_base: TimeBase, frame: str, child_frame: str = "object", *, height: float = 0.0
 ) -> Odometry:
     """The state of an object as odometry: its pose in the base frame, its twist in its own, as nav_msgs says.
 
-    The correlation between pose and twist has no place in the message and is lost.
+    The pose is at a height [m]. How pose and twist are correlated has no place in the message and is lost.
     """
     message = Odometry(
         header=Header(stamp=time_base.stamp(state.stamp), frame_id=frame), child_frame_id=child_frame
     )
     into = _rotation(-state.pose[2])
     twist = into @ state.twist
-    message.pose.pose = planar_pose(state.pose)
+    message.pose.pose = planar_pose(state.pose, height)
     message.pose.covariance = spread_covariance(state.covariance[:3, :3])
     message.twist.twist.linear.x, message.twist.twist.linear.y = float(twist[0]), float(twist[1])
     message.twist.twist.angular.z = float(twist[2])

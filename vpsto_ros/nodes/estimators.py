@@ -1,7 +1,8 @@
-"""The filters that a state estimator can run, behind one interface: Kalman filters, or particles.
+"""The filters that a state estimator can run, behind one interface: Kalman filters, particles, or a puck's.
 
 The Kalman filters know nothing of the robot: they follow what the camera says. Particles are pushed along by
-the measured motion of the tools, and can be told what these feel.
+the measured motion of the tools, and can be told what these feel. For a puck there is
+:class:`vpsto_ros.nodes.puck_estimator.PuckEstimator`.
 """
 
 import dataclasses
@@ -30,7 +31,14 @@ _SEEN = np.array([0.5, 0.0, 0.0])  # an imaginary object, to compile with
 
 
 class ObjectEstimator(Protocol):
-    """What the node asks of a filter; times are in seconds of the node's time base."""
+    """What the node asks of a filter; times are in seconds of the node's time base.
+
+    Attributes:
+        with_frames: whether a state goes out with every frame, and at the node's rate only while frames stay
+            away; else always at the node's rate.
+    """
+
+    with_frames: bool
 
     @property
     def frame_stamp(self) -> float:
@@ -85,6 +93,8 @@ def measured_at(node: ManagedNode, stamp: Time, limits: MeasurementLimits) -> fl
 class KalmanEstimator:
     """Interacting Kalman filters: the state at the last frame, predicted where frames stay away."""
 
+    with_frames = True
+
     def __init__(self, config: PlanarKalmanConfig, bridging: Bridging, rng: np.random.Generator) -> None:
         """Compile the filter."""
         self._filter, self._bridging, self._rng = PlanarKalman(config), bridging, rng
@@ -133,6 +143,8 @@ class KalmanEstimator:
 
 class ParticleEstimator:
     """Particles that are pushed along by the tools; a state is of the last measured posture of the robot."""
+
+    with_frames = True
 
     def __init__(self, particles: ObjectParticleFilter, tools: ToolPlane, bridging: Bridging) -> None:
         """Compile the filter."""

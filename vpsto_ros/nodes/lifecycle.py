@@ -21,6 +21,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
@@ -30,8 +31,9 @@ from vpsto_ros.exceptions import ConfigurationError, InvalidInputError, VpstoErr
 from vpsto_ros.nodes.conversions import TimeBase
 from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Complaints, Pulse, Report
 from vpsto_ros.nodes.parameters import check_change, declare_parameters, help_text, read_parameters
+from vpsto_ros.nodes.stop_signals import StopSignals
 
-_SIGNAL_PATIENCE = 0.5  # so long a signal takes at most from the first error to the end of the context [s]
+_LOOK = 0.1  # a spinning node looks so often whether a signal wants it to end [s]
 MAX_AHEAD = 0.5
 """A message stamped farther in the future is refused: it would look fresh long after its sender died [s]."""
 MAX_SILENCE = 1.0
@@ -130,9 +132,10 @@ class ManagedNode(LifecycleNode):
     def cleanup(self) -> None:
         """Drop what `configure` made by other means than the methods below."""
 
-    def spin(self, executor: Executor) -> None:
-        """What the main thread does while the node lives."""
-        executor.spin()
+    def spin(self, executor: Executor, signals: StopSignals) -> None:
+        """What the main thread does until a signal wants the node to end."""
+        while not signals.requested:
+            executor.spin_once(timeout_sec=_LOOK)
 
     def stop(self) -> None:
         """Bring whatever is in motion to rest; called before the node becomes inactive."""
@@ -211,8 +214,6 @@ class ManagedNode(LifecycleNode):
                 text = f"{topic} refused: {error}" if topic else str(error)
                 self.complaints.add(topic or "cycle", text)
             except Exception as error:
-                if not self.context.ok():
-                    raise  # publishing while a signal takes the context away
                 self._take_fault(error)
 
         return call
@@ -295,6 +296,11 @@ class ManagedNode(LifecycleNode):
         for trigger in (self.trigger_configure, self.trigger_activate):
             if trigger() != TransitionCallbackReturn.SUCCESS:
                 raise self.failure or RuntimeError("a lifecycle transition failed")
+
+    def end(self) -> None:
+        """Bring everything to rest and remove it, unless that was done already."""
+        if self.configured:
+            self.trigger_shutdown()
 
     # Transitions, called by rclpy.
 
@@ -413,41 +419,19 @@ def run(node_class: type[ManagedNode], name: str, args: list[str] | None = None)
     if {"-h", "--help"} & set(sys.argv if args is None else args):
         print(help_text(name, node_class.default_config))
         return 0
-    if not _initialize(args):
-        return 2
-    node = None
-    try:
-        node = _create(node_class, name)
-        if node is None:
-            return 2
-        return _spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 0
-    except Exception as error:
-        # What publishes, takes or waits while a signal ends the context fails in ways that mean nothing.
-        if not _ended_by_signal(error):
-            raise
-        return 0
-    finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-
-
-def _ended_by_signal(error: BaseException) -> bool:
-    """Whether an error comes of a signal: it says so, or the context ends, which takes a moment."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, KeyboardInterrupt):
-            return True
-        cause = cause.__cause__ or cause.__context__
-    deadline = time.monotonic() + _SIGNAL_PATIENCE
-    try:
-        while rclpy.ok() and time.monotonic() < deadline:
-            time.sleep(0.01)
-    except KeyboardInterrupt:
-        return True
-    return not rclpy.ok()
+    with StopSignals() as signals:
+        node = None
+        try:
+            if not _initialize(args):
+                return 2
+            node = _create(node_class, name)
+            return 2 if node is None else _spin(node, signals)
+        except (KeyboardInterrupt, ExternalShutdownException):
+            return 0
+        finally:
+            if node is not None:
+                node.destroy_node()
+            rclpy.try_shutdown()
 
 
 def _initialize(args: list[str] | None) -> bool:
@@ -458,7 +442,7 @@ def _initialize(args: list[str] | None) -> bool:
             raise ValueError(
                 f"unknown arguments {' '.join(unknown)}; set parameters by --ros-args -p name:=value"
             )
-        rclpy.init(args=given)
+        rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
     except (RuntimeError, ValueError) as error:
         print(f"cannot start: {error}", file=sys.stderr)
         return False
@@ -473,7 +457,7 @@ def _create(node_class: type[ManagedNode], name: str) -> ManagedNode | None:
         return None
 
 
-def _spin(node: ManagedNode) -> int:
+def _spin(node: ManagedNode, signals: StopSignals) -> int:
     # One thread: beside a second one that handles messages, a planning step of 12 ms waits over and over for
     # the interpreter and takes 20 to 30 ms. What arrives meanwhile waits in its queue.
     executor = SingleThreadedExecutor()
@@ -484,7 +468,9 @@ def _spin(node: ManagedNode) -> int:
     try:
         if node.get_parameter("autostart").value:
             node.start()
-        node.spin(executor)
+        signals.wait_for_loop()
+        node.spin(executor, signals)
+        node.end()
     except ConfigurationError:
         return 2  # logged by the transition that failed
     finally:

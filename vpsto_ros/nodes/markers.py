@@ -74,14 +74,21 @@ def arm_lines(tools: ToolPlane, q: NDArray) -> list[NDArray[np.float64]]:
 class MarkerFactory:
     """Makes markers of one node: same frame, same stamp, numbered by their names."""
 
-    def __init__(self, frame: str, stamp: Time) -> None:
-        self.frame, self.stamp = frame, stamp
+    def __init__(self, frame: str, stamp: Time, level: float = 0.0) -> None:
+        """Begin.
+
+        Args:
+            frame: of all markers.
+            stamp: of all markers.
+            level: height of the table, on which planar points are drawn [m].
+        """
+        self.frame, self.stamp, self.level = frame, stamp, level
 
     def line(self, name: str, points: NDArray, colour: Sequence[float], width: float = 0.004) -> Marker:
         """A polyline through points (K, 2) on the table or (K, 3) [m]; fewer than two make it vanish."""
         marker = self._marker(name, Marker.LINE_STRIP, colour)
         marker.scale.x = width
-        marker.points = _points(points)
+        marker.points = self._points(points)
         if len(points) < 2:
             marker.action = Marker.DELETE
         return marker
@@ -94,7 +101,7 @@ class MarkerFactory:
     def paths(self, name: str, coordinates: NDArray, colour: Sequence[float]) -> Marker:
         """Paths of all tools on the table, given their plane coordinates (K, m)."""
         pieces = [np.stack([path[:-1], path[1:]], axis=1) for path in tool_paths(coordinates)]
-        return self._segments(name, np.concatenate(pieces).reshape(-1, 2), colour)
+        return self.segments(name, np.concatenate(pieces).reshape(-1, 2), colour)
 
     def ellipses(
         self, name: str, centers: NDArray, covariances: NDArray, colour: Sequence[float]
@@ -106,7 +113,7 @@ class MarkerFactory:
             for center, covariance in zip(centers, covariances, strict=True)
         ]
         pieces = [np.stack([ring[:-1], ring[1:]], axis=1).reshape(-1, 2) for ring in rings]
-        return self._segments(name, np.concatenate([np.zeros((0, 2)), *pieces]), colour)
+        return self.segments(name, np.concatenate([np.zeros((0, 2)), *pieces]), colour)
 
     def circles(self, name: str, centers: NDArray, radii: NDArray, colour: Sequence[float]) -> Marker:
         """Circles on the table, (E, 2) and (E,) [m]."""
@@ -121,23 +128,23 @@ class MarkerFactory:
         colour: Sequence[float],
         height: float = 0.002,
     ) -> Marker:
-        """The outlines of a shape's parts at pose (x, y, yaw) and height [m]; without a pose it vanishes."""
+        """The outlines of a shape's parts at pose (x, y, yaw), height [m] above the table; None hides it."""
         marker = self._marker(name, Marker.LINE_LIST, colour)
         marker.scale.x = 0.004
         if pose is None:
             marker.action = Marker.DELETE
             return marker
         for polygon in shape.transform(np.asarray(pose, dtype=float)):
-            ring = np.column_stack([polygon, np.full(len(polygon), height)])
+            ring = np.column_stack([polygon, np.full(len(polygon), self.level + height)])
             segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1).reshape(-1, 3)
-            marker.points.extend(_points(segments))
+            marker.points.extend(self._points(segments))
         return marker
 
     def spheres(self, name: str, points: NDArray, colour: Sequence[float], diameter: float = 0.006) -> Marker:
         """Small spheres at points (K, 2) on the table or (K, 3) [m]."""
         marker = self._marker(name, Marker.SPHERE_LIST, colour)
         marker.scale.x = marker.scale.y = marker.scale.z = diameter
-        marker.points = _points(points)
+        marker.points = self._points(points)
         if not len(points):
             marker.action = Marker.DELETE
         return marker
@@ -150,14 +157,20 @@ class MarkerFactory:
         marker.text = text
         return marker
 
-    def _segments(self, name: str, ends: NDArray, colour: Sequence[float]) -> Marker:
+    def segments(self, name: str, ends: NDArray, colour: Sequence[float]) -> Marker:
         """Segments between each two ends, shape (2 S, 2) on the table [m]; without any it vanishes."""
         marker = self._marker(name, Marker.LINE_LIST, colour)
         marker.scale.x = 0.003
-        marker.points = _points(ends)
+        marker.points = self._points(ends)
         if not len(ends):
             marker.action = Marker.DELETE
         return marker
+
+    def _points(self, points: NDArray) -> list[Point]:
+        rows = np.asarray(points, dtype=float)
+        if rows.shape[1] == 2:
+            rows = np.column_stack([rows, np.full(len(rows), self.level + 0.003)])
+        return [Point(x=x, y=y, z=z) for x, y, z in rows.tolist()]
 
     def _marker(self, name: str, kind: int, colour: Sequence[float]) -> Marker:
         marker = Marker(ns=name, type=kind, action=Marker.ADD)
@@ -171,13 +184,6 @@ def tool_paths(coordinates: NDArray) -> list[NDArray]:
     """Paths (K, 2) of the tools in their plane coordinates (K, m): one for 2 or 3 columns, two for 4."""
     count = coordinates.shape[1] // 2
     return [coordinates[:, 2 * tool : 2 * tool + 2] for tool in range(count)]
-
-
-def _points(points: NDArray) -> list[Point]:
-    rows = np.asarray(points, dtype=float)
-    if rows.shape[1] == 2:
-        rows = np.column_stack([rows, np.full(len(rows), 0.003)])
-    return [Point(x=x, y=y, z=z) for x, y, z in rows.tolist()]
 
 
 def _about_x(angle: float) -> NDArray:

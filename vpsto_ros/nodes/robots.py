@@ -18,9 +18,10 @@ from vpsto_ros.robot.kinds import TOOL_KINDS, ToolKind
 from vpsto_ros.robot.tip_kinematics import BALL_RADIUS
 from vpsto_ros.robot.tool_plane import ToolPlane
 
-PUSHING, ROBUST_PUSHING = "pushing", "robust_pushing"
-TASKS = (PUSHING, ROBUST_PUSHING)
-"""What planners can do: push with the rod towards a goal pose, or push an uncertain object with any tools."""
+PUSHING, ROBUST_PUSHING, SHOOTING = "pushing", "robust_pushing", "shooting"
+TASKS = (PUSHING, ROBUST_PUSHING, SHOOTING)
+"""What planners can do: push with the rod towards a goal pose, push an uncertain object with any tools, or
+shoot a puck at a goal."""
 
 
 @documented

@@ -22,8 +22,9 @@ from vpsto_ros.nodes.estimators import (
     measured_at,
 )
 from vpsto_ros.nodes.lifecycle import ManagedNode, best_effort, latched, reliable, run
+from vpsto_ros.nodes.puck_estimator import PuckEstimator, puck_model
 from vpsto_ros.nodes.robots import belief_dynamics
-from vpsto_ros.nodes.state_estimator_config import KALMAN, StateEstimatorConfig
+from vpsto_ros.nodes.state_estimator_config import KALMAN, PUCK, StateEstimatorConfig
 
 
 class StateEstimator(ManagedNode):
@@ -54,6 +55,11 @@ class StateEstimator(ManagedNode):
         rng, bridging = np.random.default_rng(config.seed), Bridging(config.fresh, config.prediction)
         if config.kind == KALMAN:
             return KalmanEstimator(config.filter, bridging, rng)
+        if config.kind == PUCK:
+            model = puck_model(config.puck_model)
+            puck = PuckEstimator(model, config.puck, config.hockey, bridging, rng)
+            puck.listen(self)
+            return puck
         dynamics = belief_dynamics(config.robot, config.model, config.way_variance)
         particles = ObjectParticleFilter(config.particles, dynamics, rng, config.limits)
         made = ParticleEstimator(particles, config.robot.plane(), bridging)
@@ -115,7 +121,8 @@ class StateEstimator(ManagedNode):
             stamp, now = measured_at(self, message.header.stamp, self.config.limits), self.now()
             self._update(stamp, reading.pose, self._default_covariance if covariance is None else covariance)
         self._last_frame = now
-        self._publish(now)
+        if self.estimator.with_frames:
+            self._publish(now)
 
     def _update(self, stamp: float, pose: NDArray, covariance: NDArray) -> None:
         outcome = self.estimator.update(stamp, pose, covariance)
@@ -126,15 +133,16 @@ class StateEstimator(ManagedNode):
             self.complaints.add(outcome.kind, f"frame not used, {outcome.kind}: {outcome.reason}")
 
     def _bridge(self) -> None:
-        """Keep the state coming while frames stay away."""
+        """Keep the state coming, by some filters only while frames stay away."""
         now = self.now()
-        if now - self._last_frame >= 1.5 / self.config.rate:
+        if not self.estimator.with_frames or now - self._last_frame >= 1.5 / self.config.rate:
             self._publish(now)
 
     def _publish(self, now: float) -> None:
         state = self.estimator.state(now)
         if state is not None:
-            self._state_publisher.publish(state_message(state, self.time_base, self.config.base_frame))
+            frame, height = self.config.base_frame, self.config.surface
+            self._state_publisher.publish(state_message(state, self.time_base, frame, height=height))
             self._rate.tick()
 
     def _publish_belief(self) -> None:
@@ -146,7 +154,8 @@ class StateEstimator(ManagedNode):
         self._belief_publisher.publish(belief_message(self._belief, stamp, self.config.base_frame))
 
     def _publish_markers(self) -> None:
-        make = markers.MarkerFactory(self.config.base_frame, self.get_clock().now().to_msg())
+        stamp = self.get_clock().now().to_msg()
+        make = markers.MarkerFactory(self.config.base_frame, stamp, self.config.surface)
         drawn = [make.spheres("object_belief", self._belief[:, :2], markers.ESTIMATE)]
         self._marker_publisher.publish(MarkerArray(markers=drawn))
 

@@ -6,12 +6,14 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.measurement import MeasurementLimits
 from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
 from vpsto_ros.estimation.planar_kalman import PlanarKalmanConfig
+from vpsto_ros.estimation.puck_filter import PuckFilterConfig
 from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.nodes.hockey_table import HockeyTableConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import RobotConfig
 from vpsto_ros.nodes.scene import ModelConfig, TableConfig
 
-KALMAN, PARTICLES = "kalman", "particles"
+KALMAN, PARTICLES, PUCK = "kalman", "particles", "puck"
 
 
 @documented
@@ -21,9 +23,10 @@ class StateEstimatorConfig(NodeConfig):
 
     kind: str = option(
         KALMAN,
-        "which filter: kalman, which knows the camera only (filter.*), or particles that the robot's tools "
-        "push (particles.*, robot.*, model.*, way_variance, touch), which needs joint_states",
-        choices=(KALMAN, PARTICLES),
+        "which filter: kalman, which knows the camera only (filter.*); particles that the robot's tools push "
+        "(particles.*, robot.*, model.*, way_variance, touch), which need joint_states; or that of an "
+        "air-hockey puck (puck.*, puck_model, hockey.*), which the mallet of an iiwa hits: joint_states",
+        choices=(KALMAN, PARTICLES, PUCK),
     )
     rate: float = option(50.0, "rate at which object_state is kept up", unit="Hz", minimum=1.0, maximum=200.0)
     belief_rate: float = option(20.0, "rate of object_belief", unit="Hz", minimum=0.1, maximum=100.0)
@@ -80,11 +83,19 @@ class StateEstimatorConfig(NodeConfig):
         minimum=0.0,
         maximum=0.1,
     )
+    puck_model: str = option("", "file with the learned model of the puck; empty takes the package's")
     table: TableConfig = dataclasses.field(default_factory=TableConfig)
     filter: PlanarKalmanConfig = dataclasses.field(default_factory=PlanarKalmanConfig)
     particles: ParticleFilterConfig = dataclasses.field(default_factory=ParticleFilterConfig)
     robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+    puck: PuckFilterConfig = dataclasses.field(default_factory=PuckFilterConfig)
+    hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
+
+    @property
+    def surface(self) -> float:
+        """Height of the table that the object lies on, base frame [m]."""
+        return self.hockey.surface if self.kind == PUCK else 0.0
 
     @property
     def limits(self) -> MeasurementLimits:
@@ -95,7 +106,7 @@ class StateEstimatorConfig(NodeConfig):
         validate(self)
         if self.touch and self.kind != PARTICLES:
             raise ConfigurationError(
-                f"touch = True needs kind = '{PARTICLES}'; the Kalman filters know nothing of forces"
+                f"touch = True needs kind = '{PARTICLES}'; the other filters know nothing of forces"
             )
         if self.kind == PARTICLES and self.belief_samples < 2:
             raise ConfigurationError(

@@ -23,10 +23,11 @@ _PARALLEL = 1e-7  # columns of the Jacobian whose cross product is less [m^2]
 _NO_PART = 1e-8  # of a joint in the dual, relative to its length [m]
 
 # Entries of the row of rules: the first six are those of PlayRules.kernel_row, the others of StrikeConfig.
-HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT, RUN_UP, HOLD, BRAKE, LEAD_WEIGHT, STEEPNESS = range(11)
+HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT = range(6)
+RUN_UP, HOLD, BRAKE, LEAD_WEIGHT, STEEPNESS = range(6, 11)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fastest(jac, ex, ey, limits, rates):
     """Largest v with v (ex, ey, 0) = J qd and |qd| <= limits, (5.13), with the joint rates that give it.
 
@@ -64,7 +65,7 @@ def fastest(jac, ex, ey, limits, rates):
     return _primal(jac, ex, ey, limits, rates, best, bx, by, bz)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _primal(jac, ex, ey, limits, rates, best, lx, ly, lz):
     """Rates at the optimum: joints with a part in the dual l at their limits, the others make up the rest.
 
@@ -90,7 +91,7 @@ def _primal(jac, ex, ey, limits, rates, best, lx, ly, lz):
     return best if worst < 1.0 + 1e-6 and abs(ox) + abs(oy) + abs(oz) < 1e-6 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _make_up(jac, free, rx, ry, rz, lx, ly, lz, limits, rates):
     """The rest (rx, ry, rz) by the free joints, in the plane across l, at the least share of their limits.
 
@@ -136,7 +137,7 @@ def _make_up(jac, free, rx, ry, rz, lx, ly, lz, limits, rates):
             rates[k] = math.copysign(limits[k], across[k]) * rest / reach
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def straighten(q, rates, jac, curvature, probe, points, axes, other):
     """The least joint acceleration per s^2, kappa (7,), that keeps the universal joint on its line."""
     for k in range(7):
@@ -152,7 +153,7 @@ def straighten(q, rates, jac, curvature, probe, points, axes, other):
     add_least_motion(jac, -cx / _DIFFERENCE, -cy / _DIFFERENCE, -cz / _DIFFERENCE, curvature)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _overspeed(rates, curvature, limits, rules):
     """Largest share of the limits of velocity and acceleration on the way, at least 1.
 
@@ -180,7 +181,7 @@ def _overspeed(rates, curvature, limits, rules):
     return worst
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _breaches(q, rates, curvature, positions, rules, probe, points, axes):
     """How far a strike leaves the plane, the place or the postures that are allowed, weighed [m/s]."""
     begin, end = -0.5 * rules[RUN_UP], rules[HOLD] + 0.5 * rules[BRAKE]
@@ -199,7 +200,7 @@ def _breaches(q, rates, curvature, positions, rules, probe, points, axes):
     return cost
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def rate_posture(q, angle, limits, positions, rules, home, rates, curvature, work):
     """Score of a posture whose universal joint is in place: speed, less breaches and the way from home.
 
@@ -237,7 +238,7 @@ def rate_posture(q, angle, limits, positions, rules, home, rates, curvature, wor
     return speed - breaches - rules[LEAD_WEIGHT] * lead, speed, breaches
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def search_posture(x, y, angle, limits, positions, rules, home, seeds, noise, refined, posture, rates):
     """The best posture for a strike with the universal joint at (x, y): random starts, the best refined.
 

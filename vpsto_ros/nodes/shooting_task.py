@@ -1,0 +1,141 @@
+"""Shots at a goal as a task of the contact planner: a puck's object_state in, the touch of the mallet out."""
+
+import dataclasses
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from visualization_msgs.msg import Marker
+
+from vpsto_ros.estimation.puck_filter import PuckState
+from vpsto_ros.nodes import markers
+from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
+from vpsto_ros.nodes.conversions import contact_message, read_state
+from vpsto_ros.nodes.hockey_table import strike_table
+from vpsto_ros.nodes.inputs import CONTACT_AHEAD
+from vpsto_ros.nodes.lifecycle import ManagedNode
+from vpsto_ros.nodes.puck_estimator import puck_model
+from vpsto_ros.planning.contact import ContactPlan
+from vpsto_ros.planning.shooting import SETTINGS, ShootingPlanner, Shot
+from vpsto_ros.planning.shot_preview import ShotPreview, preview
+from vpsto_ros.robot.iiwa import iiwa14
+
+SAME_SHOT = 0.02
+"""A refused contact whose time differs by less is the chosen shot's [s]."""
+_LEAST_VARIANCE = 1e-8  # of where to touch, so that the covariance stays positive definite [m²]
+_DOTS = 3  # every so many states of the puck's way get an ellipse
+
+
+class ShootingContacts:
+    """The mallet of an iiwa and a puck of which object_state says how it moves."""
+
+    def __init__(self, node: ManagedNode, config: ContactPlannerNodeConfig) -> None:
+        """Set up the planner and listen."""
+        self._node, self._config, self._table = node, config, config.hockey
+        shooting = dataclasses.replace(config.shooting, base=tuple(-self._table.origin))
+        if config.setting != OWN_SETTING:
+            shooting = dataclasses.replace(shooting, objective=SETTINGS[config.setting])
+        self._model = puck_model(config.puck_model)
+        strikes = strike_table(self._table)
+        self.planner = ShootingPlanner(self._model, strikes, shooting)
+        self._warm_up(np.array(strikes.rules.home))
+        self.forget()
+        node.subscribe(Odometry, "object_state", self._receive_object)
+        node.subscribe(Odometry, "refused_contact", self._receive_refusal)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the arm's joints."""
+        return iiwa14().joint_names
+
+    @property
+    def surface(self) -> float:
+        """Height of the table [m]."""
+        return self._table.surface
+
+    def forget(self) -> None:
+        """Forget puck and shot."""
+        self.puck: PuckState | None = None
+        self.planner.forget()
+
+    def missing(self, now: float, limit: float) -> str:
+        """What keeps it from planning."""
+        if self.puck is None or now - self.puck.stamp > limit:
+            self.planner.forget()
+            return f"no object_state within {limit} s"
+        return ""
+
+    def plan(self, now: float, joints: NDArray) -> list[Odometry]:
+        """Where, when and how fast the mallet shall touch; nothing while there is no shot."""
+        assert self.puck is not None, "`missing` says so"
+        shot = self.planner.plan(now, self.puck, joints)
+        if shot is None:
+            return []
+        covariance = self._seen(shot).at_touch[:2, :2] + _LEAST_VARIANCE * np.eye(2)
+        place, frame = self._table.to_base(shot.mallet[:2]), self._config.base_frame
+        touch = ContactPlan(shot.time, place, shot.mallet[2:], covariance)
+        return [contact_message(touch, self._node.time_base, frame, self._config.tool_frame)]
+
+    def status(self) -> str:
+        """What is intended, or why nothing is."""
+        shot = self.planner.committed
+        return f"no shot: {self.planner.reason}" if shot is None else describe(shot)
+
+    def _touch(self, make: markers.MarkerFactory, shot: Shot | None) -> list[Marker]:
+        """The mallet at the touch, and the way that it moves on."""
+        mallet = np.zeros((0, 2)) if shot is None else self._table.to_base(shot.mallet[None, :2])
+        stroke = np.zeros((0, 2)) if shot is None else mallet + 0.15 * np.outer((0.0, 1.0), shot.mallet[2:])
+        radii = np.full(len(mallet), self._model.table.mallet_radius)
+        return [
+            make.circles("touch", mallet, radii, markers.CONTACT),
+            make.line("stroke", stroke, markers.CONTACT),
+        ]
+
+    def _seen(self, shot: Shot | None) -> ShotPreview | None:
+        if self.puck is None:
+            return None
+        return preview(self._model, self.planner.config, self.puck, shot)
+
+    def _receive_object(self, message: Odometry) -> None:
+        self._node.seconds(message.header.stamp)
+        state = read_state(message, self._node.time_base, self._config.base_frame)
+        self.puck = self._table.puck_state(state)
+
+    def _receive_refusal(self, message: Odometry) -> None:
+        """Drop a shot that the arm has no motion for; what comes later is another one."""
+        time, shot = self._node.seconds(message.header.stamp, CONTACT_AHEAD), self.planner.committed
+        if shot is not None and abs(time - shot.time) < SAME_SHOT:
+            self.planner.forget()
+            words = "the arm has no motion for the shot; another is sought"
+            self._node.complaints.add("refused_contact", words)
+
+    def _warm_up(self, home: NDArray) -> None:
+        """Compile whatever shots use: a round over all contact times, and a look at the result."""
+        puck = PuckState(0.0, np.array([-0.5, 0.0, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
+        for index in range(30):
+            self.puck = dataclasses.replace(puck, stamp=0.02 * index)
+            self.plan(0.02 * index, home)
+        preview(self._model, self.planner.config, puck, None)
+
+    def markers(self, make: markers.MarkerFactory) -> list[Marker]:
+        """The way of the puck that is expected with its ellipses of two standard deviations, and the shot."""
+        shot, seen = self.planner.committed, self._seen(self.planner.committed)
+        if seen is None:
+            return []
+        way = self._table.to_base(seen.mean[:, :2])
+        ellipses = slice(seen.touch, None, _DOTS) if shot is not None else slice(0, None, _DOTS)
+        spreads = 4.0 * seen.covariance[ellipses, :2, :2]
+        where = self._table.to_base(np.array([-0.3, 0.62]))
+        return [
+            make.line("puck_path", way[: seen.touch], markers.PREDICTION),
+            make.line("shot_path", way[seen.touch :], markers.PLAN),
+            make.ellipses("shot_spread", way[ellipses], spreads, markers.PREDICTION),
+            *self._touch(make, shot),
+            make.text("shot", self.status(), (*where, self.surface + 0.1), 0.05),
+        ]
+
+
+def describe(shot: Shot) -> str:
+    """A shot in words."""
+    banks = {0: "direct", 1: "1 bank"}.get(shot.banks, f"{shot.banks} banks")
+    return f"{100.0 * shot.goal:.0f} % to score, {banks}, {shot.goal_speed:.1f} m/s at the goal"
