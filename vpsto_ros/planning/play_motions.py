@@ -103,7 +103,7 @@ class PlayMotion:
         if n_via not in self._bases:
             basis = OptimalBasis.uniform(n_via)
             total = self.end.time - self.begin.time
-            if n_via and self.timed and self._last < total / (n_via + 1):
+            if n_via and self.timed and 0.0 < self._last < total / (n_via + 1):
                 late = 1.0 - self._last / total
                 basis = OptimalBasis(np.append(late * np.arange(1, n_via + 1) / n_via, 1.0))
             self._bases[n_via] = basis
