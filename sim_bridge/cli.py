@@ -124,6 +124,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
+    "shooting": Choice(
+        "sim_bridge.experiments.hockey.shooting",
+        "the iiwa shoots pucks: score, speed, banks by setting",
+    ),
 }
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),
