@@ -2,7 +2,7 @@
 
 Three settings of the agent as in the thesis, one that must use a rim, and moving pucks; beside them planners
 that take the expected way of the puck for certain, with the same filter, the same MPC and the same knowledge
-of the mallet's swing. The camera is noisy, late and loses frames. Drag, rims, mallet and the friction of the arm
+of the mallet's swing. The camera is noisy, late and loses frames. Drag, rims, mallet and the arm's friction
 differ from shot to shot from what the models were learned with; `--nominal` repeats all shots without that.
 
 Whatever the arm does counts: pucks that it does not strike are misses. So are shots that go in after a second

@@ -1,4 +1,4 @@
-"""The figures of the shooting experiment: chances of single shots, plans over the table, and what was shot."""
+"""The figures of the shooting experiment: chances of single shots, plans, and what was shot."""
 
 import pathlib
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ def write_chances(path: pathlib.Path) -> None:
 
 def aimed(model: PuckModel, banks: int, speed: float) -> NDArray[np.float64]:
     """State (4,) of the mallet whose shot at the resting puck is expected nearest the middle of the goal."""
-    angles = np.linspace(*np.radians([-70.0, 70.0]), 4001)
+    angles = np.radians(np.linspace(-70.0, 70.0, 4001))
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     mallets = np.hstack([PUCK[:2] - model.table.contact_distance * normals, speed * normals])
     outlook = model.shots(PUCK, _STILL, mallets)

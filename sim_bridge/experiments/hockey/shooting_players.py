@@ -1,4 +1,4 @@
-"""Who shoots in the shooting experiment: the agent with each of its settings, and planners without chances."""
+"""Who shoots in the experiment: the agent with each of its settings, and planners without chances."""
 
 import dataclasses
 import functools
@@ -42,7 +42,7 @@ BASELINES: dict[str, ShootingObjective] = {
 }
 """Of planners that take the expected way of the puck for certain.
 
-"baseline": straight at the middle of the goal at full speed, as soon as possible, as conventional planners do.
+"baseline": straight at the middle of the goal at full speed and soon, as conventional planners do.
 "baseline_fastest": whatever is expected to get in fastest, banks and posts included: what is left of the
 aggressive setting without its chance constraint.
 """
@@ -63,8 +63,10 @@ def strike_table() -> StrikeTable:
 
 def certain(model: PuckModel) -> PuckModel:
     """The same expectations without any scatter, and without lively bounces."""
-    modes = {name: _certain(getattr(model, name)) for name in ("floating", "wall", "mallet")}
-    return dataclasses.replace(model, **modes, lively=None, lively_share=0.0)
+    floating, wall, mallet = _certain(model.floating), _certain(model.wall), _certain(model.mallet)
+    return dataclasses.replace(
+        model, floating=floating, wall=wall, mallet=mallet, lively=None, lively_share=0.0
+    )
 
 
 def _certain(mode: LinearGaussian) -> LinearGaussian:
@@ -83,7 +85,7 @@ def config(name: str) -> ShootingConfig:
 
 
 def player(name: str, seed: int) -> HockeyAgent:
-    """The agent, ready to play; filter, strikes, MPC and the model of the mallet's swing are the same for all.
+    """The agent, ready to play; filter, strikes, MPC and the model of the mallet's swing are common to all.
 
     Only the planner of a baseline is certain; its filter is not.
     """

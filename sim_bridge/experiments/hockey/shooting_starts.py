@@ -48,7 +48,7 @@ def start(task: ShotTask) -> NDArray[np.float64]:
     """
     rng = np.random.default_rng([task.seed, 0])
     if task.name == "moving":
-        place = [rng.uniform(*PASS_X), rng.uniform(*PASS_Y)]
+        place = np.array([rng.uniform(*PASS_X), rng.uniform(*PASS_Y)])
         angle, speed = math.pi + rng.uniform(-PASS_ANGLE, PASS_ANGLE), rng.uniform(*PASS_SPEED)
     else:
         row, column = divmod(task.seed % (len(GRID_X) * len(GRID_Y)), len(GRID_Y))

@@ -1,6 +1,7 @@
-"""What shots amount to: scores with intervals, speeds, banks, how well chances were known, rules, step times."""
+"""What shots amount to: scores, speeds, banks, how well chances were known, rules, step times."""
 
 import collections
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -71,7 +72,7 @@ BINS = (0.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 def reliability(found: Sequence[ShotResult]) -> list[dict[str, Any]]:
     """Predicted and observed shares of goals, by predicted chance."""
     rows = []
-    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+    for low, high in itertools.pairwise(BINS):
         last = high == BINS[-1]
         chosen = [shot for shot in found if low <= shot.predicted < high or (last and shot.predicted == high)]
         if chosen:

@@ -1,4 +1,4 @@
-"""One shot of the shooting experiment: the agent against the simulated world at 50 Hz, and what came of it."""
+"""One shot of the experiment: the agent against the simulated world at 50 Hz, and what came of it."""
 
 import dataclasses
 import gc
@@ -195,7 +195,8 @@ class Trial:
             return math.nan, math.nan, math.nan
         normal = np.array([math.cos(self._shot.angle), math.sin(self._shot.angle)])
         off = self._mallet - self._shot.mallet
-        return float(normal[0] * off[1] - normal[1] * off[0]), float(off[:2] @ normal), float(off[2:] @ normal)
+        across = float(normal[0] * off[1] - normal[1] * off[0])
+        return across, float(off[:2] @ normal), float(off[2:] @ normal)
 
     def _violations(self) -> dict[str, int]:
         broken = {"limits": self.world.limits.violations, **self.world.rules.report().violations}
