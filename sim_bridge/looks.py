@@ -12,28 +12,30 @@ _FLOOR_COLOUR = (0.72, 0.75, 0.78, 1.0)
 
 def add_looks(spec: mujoco.MjSpec) -> None:
     """Add furniture, light and the cameras ``overview``, ``side`` and ``top``; the table is at z = 0."""
-    _set_quality(spec)
-    _add_light(spec)
+    set_quality(spec, (0.4, 0.0, 0.25), 1.2)
+    add_light(spec)
     _add_furniture(spec)
     world = spec.worldbody
-    _add_camera(world, "overview", eye=(1.50, -1.00, 0.95), target=(0.34, 0.0, 0.24), fovy=40.0)
-    _add_camera(world, "side", eye=(0.45, -1.75, 0.45), target=(0.35, 0.0, 0.30), fovy=38.0)
+    add_camera(world, "overview", eye=(1.50, -1.00, 0.95), target=(0.34, 0.0, 0.24), fovy=40.0)
+    add_camera(world, "side", eye=(0.45, -1.75, 0.45), target=(0.35, 0.0, 0.30), fovy=38.0)
     half = math.sqrt(0.5)
     world.add_camera(name="top", pos=[0.45, 0.0, 1.75], quat=[half, 0, 0, -half], fovy=40.0)
 
 
-def _set_quality(spec: mujoco.MjSpec) -> None:
+def set_quality(spec: mujoco.MjSpec, center: tuple[float, float, float], extent: float) -> None:
+    """Good pictures of what is around a point [m], at most an extent [m] away, without a graphics card."""
     # Large shadow maps and multisampling cut the frame rate of software rendering to a tenth.
     visual = spec.visual
     visual.quality.shadowsize = 1024
     visual.quality.offsamples = 0
     getattr(visual, "global").offwidth = 1920
     getattr(visual, "global").offheight = 1080
-    spec.stat.center = [0.4, 0.0, 0.25]
-    spec.stat.extent = 1.2
+    spec.stat.center = list(center)
+    spec.stat.extent = extent
 
 
-def _add_light(spec: mujoco.MjSpec) -> None:
+def add_light(spec: mujoco.MjSpec) -> None:
+    """Two lamps, and a sky."""
     headlight = spec.visual.headlight
     headlight.ambient, headlight.diffuse, headlight.specular = [0.34, 0.34, 0.36], [0.16] * 3, [0.1] * 3
     lamps = (([0.9, -0.9, 1.9], [-0.5, 0.6, -1.0], 0.48), ([-0.3, 1.2, 1.6], [0.7, -0.9, -0.8], 0.22))
@@ -68,7 +70,7 @@ def _add_furniture(spec: mujoco.MjSpec) -> None:
     _decorate(world, [0.42, 0.0, -0.77], [4.0, 4.0, 0.01], rgba=_FLOOR_COLOUR)
 
 
-def _add_camera(world, name: str, eye, target, fovy: float) -> None:
+def add_camera(world, name: str, eye, target, fovy: float) -> None:
     """A camera at eye that looks at target, upright; MuJoCo's cameras look along their negative z axis."""
     backward = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
     right = np.cross([0.0, 0.0, 1.0], backward)

@@ -5,21 +5,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sim_bridge.hockey import table
+from sim_bridge.hockey.scene import START_JOINTS, AirHockeyScene
 from sim_bridge.report import video
 from sim_bridge.report.overlay import Overlay
 from sim_bridge.report.page import number, write_page
+from sim_bridge.report.stage import AirHockeyStage, PushingStage
 from sim_bridge.report.view import Frame, ModelState, replay_page
-from sim_bridge.scene import Scene, build
+from sim_bridge.scene import Scene
+from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.kinematics import fr3_pusher
 
-
-@pytest.fixture(scope="module")
-def model():
-    return build(Scene())
+STAGE = PushingStage(Scene())
 
 
-def test_a_frame_puts_robot_object_and_target_where_they_belong(model):
-    robot, state = fr3_pusher(), ModelState(model, fr3_pusher().joint_names)
+def test_a_frame_puts_robot_object_and_target_where_they_belong():
+    robot, state = fr3_pusher(), ModelState(STAGE)
     joints = Scene().joints() + 0.1
     state.pose(Frame(joints, np.array([0.5, 0.1, 0.7]), np.array([0.55, -0.1])))
     assert state.data.site("tool_tip").xpos == pytest.approx(robot.forward(joints)[0], abs=1e-9)
@@ -29,13 +30,13 @@ def test_a_frame_puts_robot_object_and_target_where_they_belong(model):
 
 
 @pytest.mark.parametrize("target", [None, np.array([np.nan, np.nan])])
-def test_without_a_target_none_is_seen(model, target):
-    state = ModelState(model, fr3_pusher().joint_names)
+def test_without_a_target_none_is_seen(target):
+    state = ModelState(STAGE)
     state.pose(Frame(Scene().joints(), target=target))
     assert state.data.body("goal").xpos[2] < -0.1
 
 
-def test_the_replay_is_one_page_that_loads_nothing(model):
+def test_the_replay_is_one_page_that_loads_nothing():
     joints = Scene().joints()
     path = np.linspace([0.4, 0.0, 0.01], [0.5, 0.1, 0.01], 30)
     plan = Overlay("planned_tool_path", np.stack([path[:-1], path[1:]], axis=1), (0.1, 0.4, 0.9), 0.003)
@@ -44,7 +45,7 @@ def test_the_replay_is_one_page_that_loads_nothing(model):
     poses = [np.array([0.5, 0.01 * i, 0.0]) for i in range(5)]
     target = np.array([0.6, 0.0])
     frames = [Frame(joints + 0.01 * i, poses[i], target, overlays[i]) for i in range(5)]
-    page = replay_page(model, fr3_pusher().joint_names, frames, 20.0)
+    page = replay_page(STAGE, frames, 20.0)
     assert "__VISER_EMBED_DATA__" in page
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=\"(?!data:)", page)
 
@@ -93,6 +94,26 @@ def test_a_machine_without_opengl_gets_advice_instead_of_a_video(tmp_path, monke
             return SimpleNamespace(result=result)
 
     monkeypatch.setattr(video.concurrent.futures, "ProcessPoolExecutor", Pool)
-    note = video.write_video(tmp_path / "video.mp4", Scene(), (), [], 20.0)
+    note = video.write_video(tmp_path / "video.mp4", STAGE, [], 20.0)
     assert "apt install libegl1" in note and "eglQueryString" in note
     assert not (tmp_path / "video.mp4").exists()
+
+
+def test_a_frame_of_air_hockey_puts_puck_and_hanging_mallet_where_they_belong():
+    state, joints = ModelState(AirHockeyStage(AirHockeyScene())), np.array(START_JOINTS) + 0.05
+    state.pose(Frame(joints, np.array([1.2, -0.1, 0.7])))
+    assert state.data.body("puck").xpos[:2] == pytest.approx([1.2, -0.1])
+    joint = iiwa14().forward(joints)[0]
+    geom = state.data.geom("mallet")
+    assert geom.xpos == pytest.approx(joint - [0.0, 0.0, table.MALLET_OFFSET], abs=1e-6)
+    assert geom.xmat.reshape(3, 3)[2, 2] == pytest.approx(-1.0, abs=1e-9)
+
+
+def test_texts_of_nodes_are_written_into_the_picture():
+    blank = np.full((video.HEIGHT, video.WIDTH, 3), 255, dtype=np.uint8)
+    said = Overlay("shot", np.zeros((1, 3)), (1.0, 1.0, 1.0), 0.05, "97 % to score")
+    frame = Frame(np.zeros(7), overlays=(said,))
+    written = video._with_texts(blank, frame)
+    dark = np.argwhere(written.min(axis=2) < 100)
+    assert len(dark) > 200 and dark[:, 0].min() > 0.8 * video.HEIGHT
+    assert video._with_texts(blank, Frame(np.zeros(7))) is blank

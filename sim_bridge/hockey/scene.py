@@ -83,6 +83,11 @@ def build(scene: AirHockeyScene) -> mujoco.MjModel:
     (table frame) and ``puck_yaw``; bodies ``puck`` and ``mallet``; geoms ``rim_left`` and so on; actuators
     as the joints they turn; site ``universal_joint``.
     """
+    return specify(scene).compile()
+
+
+def specify(scene: AirHockeyScene) -> mujoco.MjSpec:
+    """The same before it is compiled, for those who add what is only seen."""
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     spec.modelname = "air_hockey"
     _set_options(spec)
@@ -92,7 +97,7 @@ def build(scene: AirHockeyScene) -> mujoco.MjModel:
     _add_surface(table)
     _add_rims(table, scene)
     _add_puck(table, scene)
-    return spec.compile()
+    return spec
 
 
 def _set_options(spec: mujoco.MjSpec) -> None:

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LINE_STRIP, LINE_LIST, SPHERE_LIST = 4, 5, 7
+LINE_STRIP, LINE_LIST, SPHERE_LIST, TEXT = 4, 5, 7, 9
 """Types of visualization_msgs/Marker that are understood."""
 MARKERS = {
     "/state_estimator/markers": ("object_belief",),
-    "/contact_planner/markers": ("touch", "contact_prior"),
+    "/contact_planner/markers": (
+        "touch", "contact_prior", "puck_path", "shot_path", "shot_spread", "stroke", "shot",
+    ),
     "/mpc_planner/markers": ("planned_tool_path", "predicted_object_path", "predicted_spread"),
-}
+}  # fmt: skip
 """What is drawn of each topic."""
 ON_TOP = ("object_belief", "predicted_object_path", "predicted_spread")
 """These would be hidden below the object: they are drawn at its height."""
@@ -24,19 +26,21 @@ _LIFT = 0.009  # lines lie so much higher than their markers, clear of the table
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Lines or points in one colour.
+    """Lines or points in one colour, or a text.
 
     Attributes:
         name: of the marker.
-        points: ends of the segments, shape (S, 2, 3), or points, shape (N, 3) [m].
+        points: ends of the segments, shape (S, 2, 3), or points, shape (N, 3) [m]; where a text is, (1, 3).
         colour: red, green, blue from 0 to 1.
         width: of lines, or diameter of points [m].
+        text: empty for lines and points.
     """
 
     name: str
     points: NDArray[np.float64]
     colour: tuple[float, float, float]
     width: float
+    text: str = ""
 
     @property
     def lines(self) -> bool:
@@ -54,7 +58,11 @@ def overlays_of(markers: Iterable[Any], wanted: Sequence[str], height: float) ->
     """
     found = []
     for marker in markers:
-        if marker.ns not in wanted or marker.action != 0 or not len(marker.points):
+        if marker.ns not in wanted or marker.action != 0:
+            continue
+        if marker.type == TEXT:
+            found.append(_text(marker))
+        if not len(marker.points):
             continue
         points = np.array([(p.x, p.y, p.z) for p in marker.points], dtype=float)
         points[:, 2] += _LIFT + (height if marker.ns in ON_TOP else 0.0)
@@ -67,3 +75,9 @@ def overlays_of(markers: Iterable[Any], wanted: Sequence[str], height: float) ->
         colour = marker.color
         found.append(Overlay(marker.ns, points, (colour.r, colour.g, colour.b), marker.scale.x))
     return tuple(found)
+
+
+def _text(marker: Any) -> Overlay:
+    place, colour = marker.pose.position, marker.color
+    point = np.array([[place.x, place.y, place.z]], dtype=float)
+    return Overlay(marker.ns, point, (colour.r, colour.g, colour.b), marker.scale.z, marker.text)

@@ -9,22 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from sim_bridge.report.stage import CAMERA, Stage
 from sim_bridge.report.view import Frame, ModelState
 
 WIDTH, HEIGHT = 960, 540
 LINE_WIDTH = 3.0
 """Of what the nodes draw [pixels]."""
+TEXT_HEIGHT = 26
+"""Of a line of text [pixels]."""
 REMEDY = "apt install libegl1 libgl1 (or libosmesa6, and set MUJOCO_GL=osmesa)"
 
 
-def write_video(
-    path: Path,
-    scene: Any,
-    joint_names: Sequence[str],
-    frames: Sequence[Frame],
-    rate: float,
-    camera: str = "overview",
-) -> str:
+def write_video(path: Path, stage: Stage, frames: Sequence[Frame], rate: float, camera: str = CAMERA) -> str:
     """Render frames into an mp4 file.
 
     OpenGL is chosen when MuJoCo is imported and may end a process that has no driver for it, hence a process
@@ -32,8 +28,7 @@ def write_video(
 
     Args:
         path: file to write.
-        scene: what :func:`sim_bridge.scene.build` makes the model from.
-        joint_names: the robot's joints.
+        stage: robot, table and object.
         frames: what is seen.
         rate: frames per second.
         camera: name of the model's camera.
@@ -46,7 +41,7 @@ def write_video(
     context = multiprocessing.get_context("spawn")
     try:
         with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
-            pool.submit(_render, path, scene, tuple(joint_names), list(frames), rate, camera).result()
+            pool.submit(_render, path, stage, list(frames), rate, camera).result()
     except (
         Exception
     ) as error:  # whatever a missing driver raises: AttributeError, ImportError, FatalError, a dead process
@@ -59,16 +54,12 @@ def write_video(
     return ""
 
 
-def _render(
-    path: Path, scene: Any, joint_names: Sequence[str], frames: list[Frame], rate: float, camera: str
-) -> None:
+def _render(path: Path, stage: Stage, frames: list[Frame], rate: float, camera: str) -> None:
     import imageio
     import mujoco
 
-    from sim_bridge.scene import build
-
-    model = build(scene)
-    state = ModelState(model, joint_names)
+    state = ModelState(stage)
+    model = state.model
     options: dict[str, Any] = {
         "codec": "libx264",
         "quality": 7,
@@ -84,7 +75,7 @@ def _render(
             mujoco.mj_camlight(model, state.data)
             renderer.update_scene(state.data, camera)
             _draw_overlays(renderer.scene, frame)
-            writer.append_data(renderer.render())
+            writer.append_data(_with_texts(renderer.render(), frame))
 
 
 def _draw_overlays(scene: Any, frame: Frame) -> None:
@@ -96,7 +87,7 @@ def _draw_overlays(scene: Any, frame: Frame) -> None:
     for overlay in frame.overlays:
         rgba = np.array([*overlay.colour, 1.0], dtype=np.float32)
         size = np.full(3, 0.5 * overlay.width)
-        for item in overlay.points:
+        for item in () if overlay.text else overlay.points:
             if scene.ngeom >= scene.maxgeom:
                 return
             geom = scene.geoms[scene.ngeom]
@@ -106,3 +97,17 @@ def _draw_overlays(scene: Any, frame: Frame) -> None:
             else:
                 mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, item, level, rgba)
             scene.ngeom += 1
+
+
+def _with_texts(picture: Any, frame: Frame) -> Any:
+    """The picture (height, width, 3) with what nodes wrote at its foot."""
+    import numpy as np
+    from PIL import Image, ImageDraw, ImageFont
+
+    lines = [overlay.text for overlay in frame.overlays if overlay.text]
+    if not lines:
+        return picture
+    image = Image.fromarray(picture)
+    place, font = (16, HEIGHT - 16 - TEXT_HEIGHT * len(lines)), ImageFont.load_default(TEXT_HEIGHT - 4)
+    ImageDraw.Draw(image).multiline_text(place, "\n".join(lines), fill=(20, 24, 32), font=font)
+    return np.asarray(image)

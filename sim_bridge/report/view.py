@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.report.overlay import Overlay
+from sim_bridge.report.stage import Stage
 
 FloatArray = NDArray[np.float64]
 
@@ -40,53 +40,41 @@ class Frame:
 
 
 class ModelState:
-    """A MuJoCo model of the cell, posed for drawing; used by the browser's views and by the video alike."""
+    """The cell's model, posed for drawing; used by the browser's views and by the video alike."""
 
-    def __init__(self, model: mujoco.MjModel, joint_names: Sequence[str]) -> None:
-        """Look up the robot's joints, the object and the goal marker by their names."""
-        self.model, self.data = model, mujoco.MjData(model)
-        self._joints = [model.joint(name).qposadr[0] for name in joint_names]
-        self._object = model.joint("object").qposadr[0]
-        self._goal = model.body("goal").mocapid[0]
+    def __init__(self, stage: Stage) -> None:
+        """Build the model and look up the robot's joints."""
+        self._stage, self.model = stage, stage.build()
+        self.data = mujoco.MjData(self.model)
+        self._joints = [self.model.joint(name).qposadr[0] for name in stage.joint_names]
 
     def pose(self, frame: Frame) -> None:
         """Put everything where it is in a frame and update the poses of all bodies."""
-        qpos = self.data.qpos
-        qpos[self._joints] = frame.joints
-        start = self._object
-        if frame.object_pose is not None:
-            x, y, yaw = frame.object_pose
-            qpos[start : start + 7] = (x, y, 0.0, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
-        # A target is drawn turned like the object, for it has no orientation; else it hides below the table.
-        place = (0.5, 0.0, -0.5)
-        if frame.target is not None and np.all(np.isfinite(frame.target[:2])):
-            place = (*frame.target[:2], 0.0005)
-        self.data.mocap_pos[self._goal] = place
-        self.data.mocap_quat[self._goal] = qpos[start + 3 : start + 7]
+        self.data.qpos[self._joints] = frame.joints
+        self._stage.place(self.model, self.data, frame)
         mujoco.mj_kinematics(self.model, self.data)
 
 
 class CellView:
     """Draws the cell with viser and moves it."""
 
-    def __init__(self, server: Any, model: mujoco.MjModel, joint_names: Sequence[str]) -> None:
+    def __init__(self, server: Any, stage: Stage) -> None:
         """Build the scene.
 
         Args:
             server: a running ``viser.ViserServer``.
-            model: robot, table, object and goal marker.
-            joint_names: the robot's joints, in the order of a frame's positions.
+            stage: robot, table and object.
         """
         self._server = server
-        self._state = ModelState(model, joint_names)
-        scene = server.scene
+        self._state = ModelState(stage)
+        scene, model, view = server.scene, self._state.model, stage.viewpoint
         scene.set_up_direction("+z")
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=True, cast_shadow=False)
         scene.add_light_ambient("/light", intensity=0.9)
         camera = server.initial_camera
-        camera.position, camera.look_at, camera.up = (1.42, -0.92, 0.92), (0.36, 0.0, 0.17), (0.0, 0.0, 1.0)
-        camera.fov = math.radians(42.0)
+        camera.position, camera.look_at, camera.up = view.eye, view.target, (0.0, 0.0, 1.0)
+        camera.fov = view.field
         mujoco.mj_kinematics(model, self._state.data)
         self._bodies = {body: self._add_body(body) for body in range(model.nbody)}
         self._overlays: dict[str, Any] = {}
@@ -124,7 +112,9 @@ class CellView:
             if overlay is self._drawn.get(name):
                 continue
             self._drawn[name] = overlay
-            if name in self._overlays:
+            if name in self._overlays and overlay.text:
+                self._overlays[name].text = overlay.text
+            elif name in self._overlays:
                 self._overlays[name].points = overlay.points
             else:
                 self._overlays[name] = self._add_overlay(overlay)
@@ -132,6 +122,8 @@ class CellView:
     def _add_overlay(self, overlay: Overlay) -> Any:
         scene, path = self._server.scene, f"/overlay/{overlay.name}"
         colour = tuple(round(255 * value) for value in overlay.colour)
+        if overlay.text:
+            return scene.add_label(path, overlay.text, position=tuple(overlay.points[0]))
         if overlay.lines:
             return scene.add_line_segments(path, overlay.points, colour, thickness=overlay.width)
         return scene.add_point_cloud(
@@ -158,20 +150,17 @@ def close_server(server: Any) -> None:
         server.stop()
 
 
-def replay_page(
-    model: mujoco.MjModel, joint_names: Sequence[str], frames: Iterable[Frame], rate: float
-) -> str:
+def replay_page(stage: Stage, frames: Iterable[Frame], rate: float) -> str:
     """A self-contained HTML page that plays a run and lets one look at it from all sides.
 
     Args:
-        model: robot, table, object and goal marker.
-        joint_names: the robot's joints.
+        stage: robot, table and object.
         frames: at least one.
         rate: frames per second.
     """
     server = open_server()
     try:
-        view = CellView(server, model, joint_names)
+        view = CellView(server, stage)
         iterator = iter(frames)
         view.show(next(iterator))
         serializer = server.get_scene_serializer()

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.puck_filter import PuckState
+from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.planning.strikes import StrikeTable
 
 UNKNOWN_YAW = np.pi**2 / 3.0
 """Variance of the yaw of a puck, which nobody estimates: any is as likely [rad²]."""
@@ -57,3 +59,18 @@ class HockeyTableConfig:
         columns = np.array([0, 1, 3, 4])
         mean = np.concatenate([self.to_table(state.pose[:2]), state.twist[:2]])
         return PuckState(state.stamp, mean, state.covariance[np.ix_(columns, columns)], 0, "")
+
+
+def strike_table(config: HockeyTableConfig) -> StrikeTable:
+    """The strikes that come with the package.
+
+    Raises:
+        ConfigurationError: they are for a table that stands elsewhere.
+    """
+    strikes = StrikeTable.load()
+    if not np.allclose(strikes.rules.table, config.origin, atol=1e-6):
+        raise ConfigurationError(
+            f"hockey.x, hockey.y = {config.x:g}, {config.y:g}: the strikes of the arm are tabulated for a "
+            f"table at {strikes.rules.table_x:g}, {strikes.rules.table_y:g} m"
+        )
+    return strikes

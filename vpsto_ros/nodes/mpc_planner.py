@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -16,11 +17,14 @@ from vpsto_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Cycles, Diagnost
 from vpsto_ros.nodes.lifecycle import ManagedNode, latched, run
 from vpsto_ros.nodes.mpc_planner_config import TRANSPORT, MpcPlannerConfig
 from vpsto_ros.nodes.planning_task import PlanningTask, PushingTask
-from vpsto_ros.nodes.robots import PUSHING, ROBUST_PUSHING
+from vpsto_ros.nodes.robots import PUSHING, ROBUST_PUSHING, SHOOTING
 from vpsto_ros.nodes.robust_pushing_task import RobustPushingTask
+from vpsto_ros.nodes.strike_task import StrikeTask
 from vpsto_ros.planning.running_reference import MpcStep
 
-KINDS = {PUSHING: PushingTask, ROBUST_PUSHING: RobustPushingTask}
+KINDS: dict[str, Callable[..., PlanningTask]] = {
+    PUSHING: PushingTask, ROBUST_PUSHING: RobustPushingTask, SHOOTING: StrikeTask,
+}  # fmt: skip
 
 
 class MpcPlannerNode(ManagedNode):
@@ -57,9 +61,7 @@ class MpcPlannerNode(ManagedNode):
         try:
             return KINDS[config.kind](self, config)
         except ModuleNotFoundError as error:
-            robust = config.kind == ROBUST_PUSHING
-            search = config.robust.planning.search if robust else config.planner.online.search
-            name = "robust.planning.search" if robust else "planner.online.search"
+            name, search = config.search
             raise ConfigurationError(
                 f"{name}.strategy = '{search.strategy}' needs the Python "
                 f"package '{error.name}'; install it, or choose a strategy of this package, such as 'sep-cma'"
@@ -215,7 +217,8 @@ class MpcPlannerNode(ManagedNode):
         return response
 
     def _publish_markers(self) -> None:
-        make = markers.MarkerFactory(self.config.base_frame, self.get_clock().now().to_msg())
+        stamp = self.get_clock().now().to_msg()
+        make = markers.MarkerFactory(self.config.base_frame, stamp, self.task.surface)
         step, joints = self.last, self.arm.joints
         drawn = [
             make.paths("planned_tool_path", step.tool_path, markers.PLAN),
@@ -224,7 +227,7 @@ class MpcPlannerNode(ManagedNode):
             *self.task.markers(make, step),
         ]
         if joints is not None:
-            drawn += make.robot(self.task.tools, joints.position)
+            drawn += self.task.robot_markers(make, joints.position)
         self._marker_publisher.publish(MarkerArray(markers=drawn))
 
 

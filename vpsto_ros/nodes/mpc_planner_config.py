@@ -4,11 +4,22 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.nodes.hockey_table import HockeyTableConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
-from vpsto_ros.nodes.robots import PUSHING, ROBUST_PUSHING, TASKS, BeliefModelConfig, RobotConfig, check_task
+from vpsto_ros.nodes.robots import (
+    PUSHING,
+    ROBUST_PUSHING,
+    SHOOTING,
+    TASKS,
+    BeliefModelConfig,
+    RobotConfig,
+    check_task,
+)
 from vpsto_ros.nodes.scene import ModelConfig
+from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space.config import RobustMpcConfig
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
+from vpsto_ros.planning.strike_mpc import StrikeMpcConfig
 
 TRANSPORT = 0.004
 """What is left at least for the way from here to the controller [s]."""
@@ -18,19 +29,20 @@ _CYCLE_SHARE, _LEAD_SHARE = 0.9, 0.7  # of the cycle and of the lead that the au
 @documented
 @dataclasses.dataclass(frozen=True)
 class MpcPlannerConfig(NodeConfig):
-    """Parameters of the planner; those of ``planner`` or those of ``robust`` count, as ``kind`` says."""
+    """Parameters of the planner; ``kind`` says whether ``planner``, ``robust`` or ``strike`` counts."""
 
     kind: str = option(
         PUSHING,
-        "how to push: pushing, with the rod by an estimate of the object (planner.*), or robust_pushing, "
-        "with the tools of any robot by a belief over the object (robust.*, belief.*)",
+        "what to do: pushing, with the rod by an estimate of the object (planner.*); robust_pushing, with "
+        "the tools of any robot by a belief over the object (robust.*, belief.*); or shooting, with the "
+        "mallet of an iiwa as contact_plan says (strike.*, hockey.*)",
         choices=TASKS,
     )
     rate: float = option(20.0, "planning rate", unit="Hz", minimum=1.0, maximum=50.0)
     deadline: float = option(
         0.0,
         "a plan not ready so long after the start of its cycle is dropped; 0 takes the smaller of 0.9 cycles "
-        "and 0.7 of the lead (planner.lead or robust.lead)",
+        "and 0.7 of the lead (planner.lead, robust.lead or strike.lead)",
         unit="s",
         minimum=0.0,
         maximum=1.0,
@@ -56,6 +68,8 @@ class MpcPlannerConfig(NodeConfig):
     belief: BeliefModelConfig = dataclasses.field(default_factory=BeliefModelConfig)
     planner: PushingMpcConfig = dataclasses.field(default_factory=PushingMpcConfig)
     robust: RobustMpcConfig = dataclasses.field(default_factory=RobustMpcConfig)
+    strike: StrikeMpcConfig = dataclasses.field(default_factory=StrikeMpcConfig)
+    hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
 
     def __post_init__(self) -> None:
         validate(self)
@@ -80,19 +94,31 @@ class MpcPlannerConfig(NodeConfig):
             )
 
     @property
+    def _group(self) -> str:
+        return {PUSHING: "planner", ROBUST_PUSHING: "robust", SHOOTING: "strike"}[self.kind]
+
+    @property
     def lead(self) -> float:
         """Time between the start of planning and the moment a plan takes over [s]."""
-        return self.robust.lead if self.kind == ROBUST_PUSHING else self.planner.lead
+        return getattr(self, self._group).lead
 
     @property
     def joint_tolerance(self) -> float:
         """How far a joint may be from its reference [rad]."""
-        robust = self.kind == ROBUST_PUSHING
-        return self.robust.joint_tolerance if robust else self.planner.joint_tolerance
+        return getattr(self, self._group).joint_tolerance
+
+    @property
+    def search(self) -> tuple[str, VpstoConfig]:
+        """Name and options of the search that plans."""
+        return {
+            PUSHING: ("planner.online.search", self.planner.online.search),
+            ROBUST_PUSHING: ("robust.planning.search", self.robust.planning.search),
+            SHOOTING: ("strike.approach.search", self.strike.approach.search),
+        }[self.kind]
 
     @property
     def _lead_name(self) -> str:
-        return "robust.lead" if self.kind == ROBUST_PUSHING else "planner.lead"
+        return f"{self._group}.lead"
 
     @property
     def deadline_in_force(self) -> float:

@@ -28,8 +28,8 @@ class PlanningTask(Protocol):
         """What plans; its kernels are compiled."""
 
     @property
-    def tools(self) -> ToolPlane:
-        """The plane of the robot's tools, to draw the robot."""
+    def surface(self) -> float:
+        """Height of the table, on which is drawn, base frame [m]."""
 
     def forget(self) -> None:
         """Forget what carries a time; the goal stays."""
@@ -43,11 +43,29 @@ class PlanningTask(Protocol):
     def stamps(self) -> dict[str, float]:
         """When the latest input of each topic is of, -inf without one [s]."""
 
+    def robot_markers(self, make: markers.MarkerFactory, position: NDArray) -> list[Marker]:
+        """The robot at joint positions (n,) [rad]."""
+
     def markers(self, make: markers.MarkerFactory, step: MpcStep) -> list[Marker]:
         """What to draw besides plan, robot and status."""
 
 
-class PushingTask:
+class OnTable:
+    """What tasks with tools above a table at the robot's foot share.
+
+    Attributes:
+        tools: their plane.
+    """
+
+    surface = 0.0
+    tools: ToolPlane
+
+    def robot_markers(self, make: markers.MarkerFactory, position: NDArray) -> list[Marker]:
+        """The arms at joint positions (n,) [rad]."""
+        return make.robot(self.tools, position)
+
+
+class PushingTask(OnTable):
     """The rod pushes an object of which object_state says where it is to goal_pose."""
 
     def __init__(self, node: ManagedNode, config: MpcPlannerConfig) -> None:

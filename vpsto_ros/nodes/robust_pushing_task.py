@@ -8,12 +8,13 @@ from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.inputs import BeliefInput, ContactInput, TargetInput
 from vpsto_ros.nodes.lifecycle import ManagedNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.nodes.planning_task import OnTable
 from vpsto_ros.nodes.robots import belief_dynamics, contact_rule
 from vpsto_ros.planning.belief_space.mpc import RobustPushingMpc
 from vpsto_ros.planning.running_reference import MpcStep
 
 
-class RobustPushingTask:
+class RobustPushingTask(OnTable):
     """Any tools push an uncertain object of which object_belief has hypotheses to goal_pose."""
 
     def __init__(self, node: ManagedNode, config: MpcPlannerConfig) -> None:

@@ -1,4 +1,4 @@
-"""Shots at a goal as a task of the contact planner: object_state of a puck in, the touch of the mallet out."""
+"""Shots at a goal as a task of the contact planner: a puck's object_state in, the touch of the mallet out."""
 
 import dataclasses
 
@@ -7,18 +7,17 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from visualization_msgs.msg import Marker
 
-from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
 from vpsto_ros.nodes.conversions import contact_message, read_state
+from vpsto_ros.nodes.hockey_table import strike_table
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode
 from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.shooting import SETTINGS, ShootingPlanner, Shot
 from vpsto_ros.planning.shot_preview import ShotPreview, preview
-from vpsto_ros.planning.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 
 SAME_SHOT = 0.02
@@ -37,8 +36,9 @@ class ShootingContacts:
         if config.setting != OWN_SETTING:
             shooting = dataclasses.replace(shooting, objective=SETTINGS[config.setting])
         self._model = puck_model(config.puck_model)
-        self.planner = ShootingPlanner(self._model, StrikeTable.load(), shooting)
-        self._warm_up()
+        strikes = strike_table(self._table)
+        self.planner = ShootingPlanner(self._model, strikes, shooting)
+        self._warm_up(np.array(strikes.rules.home))
         self.forget()
         node.subscribe(Odometry, "object_state", self._receive_object)
         node.subscribe(Odometry, "refused_contact", self._receive_refusal)
@@ -81,30 +81,13 @@ class ShootingContacts:
         shot = self.planner.committed
         return f"no shot: {self.planner.reason}" if shot is None else describe(shot)
 
-    def markers(self, make: markers.MarkerFactory) -> list[Marker]:
-        """The way of the puck that is expected with its ellipses of two standard deviations, and the shot."""
-        shot, seen = self.planner.committed, self._seen(self.planner.committed)
-        if seen is None:
-            return []
-        way = self._table.to_base(seen.mean[:, :2])
-        ellipses = slice(seen.touch, None, _DOTS) if shot is not None else slice(0, None, _DOTS)
-        spreads = 4.0 * seen.covariance[ellipses, :2, :2]
-        where = self._table.to_base(np.array([-0.3, 0.62]))
-        return [
-            make.line("puck_path", way[: seen.touch], markers.PREDICTION),
-            make.line("shot_path", way[seen.touch :], markers.PLAN),
-            make.ellipses("shot_spread", way[ellipses], spreads, markers.PREDICTION),
-            *self._touch(make, shot),
-            make.text("shot", self.status(), (*where, self.surface + 0.1), 0.05),
-        ]
-
     def _touch(self, make: markers.MarkerFactory, shot: Shot | None) -> list[Marker]:
         """The mallet at the touch, and the way that it moves on."""
-        radius = self._model.table.mallet_radius
         mallet = np.zeros((0, 2)) if shot is None else self._table.to_base(shot.mallet[None, :2])
         stroke = np.zeros((0, 2)) if shot is None else mallet + 0.15 * np.outer((0.0, 1.0), shot.mallet[2:])
+        radii = np.full(len(mallet), self._model.table.mallet_radius)
         return [
-            make.circles("touch", mallet, np.array([radius]), markers.CONTACT),
+            make.circles("touch", mallet, radii, markers.CONTACT),
             make.line("stroke", stroke, markers.CONTACT),
         ]
 
@@ -123,16 +106,33 @@ class ShootingContacts:
         time, shot = self._node.seconds(message.header.stamp, CONTACT_AHEAD), self.planner.committed
         if shot is not None and abs(time - shot.time) < SAME_SHOT:
             self.planner.forget()
-            self._node.complaints.add("refused_contact", "the arm has no motion for the shot; another is sought")
+            words = "the arm has no motion for the shot; another is sought"
+            self._node.complaints.add("refused_contact", words)
 
-    def _warm_up(self) -> None:
+    def _warm_up(self, home: NDArray) -> None:
         """Compile whatever shots use: a round over all contact times, and a look at the result."""
-        state = ObjectState(0.0, np.append(self._table.to_base([-0.5, 0.0]), 0.0), np.zeros(3), 1e-6 * np.eye(6))
-        home, puck = np.array([0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0]), self._table.puck_state(state)
+        puck = PuckState(0.0, np.array([-0.5, 0.0, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
         for index in range(30):
             self.puck = dataclasses.replace(puck, stamp=0.02 * index)
             self.plan(0.02 * index, home)
         preview(self._model, self.planner.config, puck, None)
+
+    def markers(self, make: markers.MarkerFactory) -> list[Marker]:
+        """The way of the puck that is expected with its ellipses of two standard deviations, and the shot."""
+        shot, seen = self.planner.committed, self._seen(self.planner.committed)
+        if seen is None:
+            return []
+        way = self._table.to_base(seen.mean[:, :2])
+        ellipses = slice(seen.touch, None, _DOTS) if shot is not None else slice(0, None, _DOTS)
+        spreads = 4.0 * seen.covariance[ellipses, :2, :2]
+        where = self._table.to_base(np.array([-0.3, 0.62]))
+        return [
+            make.line("puck_path", way[: seen.touch], markers.PREDICTION),
+            make.line("shot_path", way[seen.touch :], markers.PLAN),
+            make.ellipses("shot_spread", way[ellipses], spreads, markers.PREDICTION),
+            *self._touch(make, shot),
+            make.text("shot", self.status(), (*where, self.surface + 0.1), 0.05),
+        ]
 
 
 def describe(shot: Shot) -> str:

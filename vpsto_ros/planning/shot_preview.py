@@ -60,7 +60,8 @@ def preview(
     start, spread = _hit(model, config, mean[-1], covariance[-1], shot)
     after = np.arange(0.0, longest, step)
     onward, spreads = model.predict(start, spread, after)
-    kept = np.cumsum(np.abs(onward[:, 0]) > model.table.half_length) <= 1  # the first one behind the line, too
+    # Up to the first one behind a goal line.
+    kept = np.cumsum(np.abs(onward[:, 0]) > model.table.half_length) <= 1
     return ShotPreview(
         np.concatenate([puck.stamp + before, puck.stamp + ahead + after[kept]]),
         np.concatenate([mean, onward[kept]]), np.concatenate([covariance, spreads[kept]]), len(before),

@@ -1,0 +1,91 @@
+"""Strikes as a task of the node that moves the arm: contact_plan of the mallet in place of an object."""
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from visualization_msgs.msg import Marker
+
+from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.nodes import markers
+from vpsto_ros.nodes.conversions import read_contact
+from vpsto_ros.nodes.hockey_table import strike_table
+from vpsto_ros.nodes.inputs import CONTACT_AHEAD
+from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
+from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.planning.running_reference import MpcStep
+from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.robot.iiwa_kinematics import arm_points
+
+_LATE = 0.2  # a contact that was due longer ago was meant for another clock [s]
+
+
+class StrikeTask:
+    """The mallet of an iiwa strikes where, when and as fast as contact_plan says, and waits at home else.
+
+    A contact that no motion leads to goes back on the topic refused_contact, as it came.
+    """
+
+    def __init__(self, node: ManagedNode, config: MpcPlannerConfig) -> None:
+        """Set up the planner and listen."""
+        self._node, self._config, self._table = node, config, config.hockey
+        self.planner = StrikeMpc(strike_table(self._table), config.strike, seed=config.seed)
+        self._warm_up()
+        self.forget()
+        self._refusals = node.advertise(Odometry, "refused_contact", reliable(5))
+        node.subscribe(Odometry, "contact_plan", self._receive)
+
+    @property
+    def surface(self) -> float:
+        """Height of the table [m]."""
+        return self._table.surface
+
+    def forget(self) -> None:
+        """Forget the contact."""
+        self.contact: MalletContact | None = None
+        self._received, self._message = -np.inf, None
+
+    def pending(self, now: float) -> bool:
+        """Always: waiting at home is planned, too."""
+        return True
+
+    def step(self, now: float, position: NDArray, velocity: NDArray, deadline: float) -> MpcStep:
+        """Plan once; the search has a fixed number of iterations, which fits a cycle."""
+        fresh = now - self._received <= self._config.contact_timeout
+        contact = self.contact if fresh else None
+        step = self.planner.step(now, position, velocity, contact)
+        if contact is not None and not step.valid and contact.time > now:
+            self._refusals.publish(self._message)
+        return step
+
+    def stamps(self) -> dict[str, float]:
+        """When the last contact came."""
+        return {"contact_plan": self._received}
+
+    def robot_markers(self, make: markers.MarkerFactory, position: NDArray) -> list[Marker]:
+        """The arm at joint positions (7,) [rad]."""
+        points = np.vstack([np.zeros(3), arm_points(position[None])[0]])
+        return [make.line("robot", points, markers.ROBOT, 0.04)]
+
+    def markers(self, make: markers.MarkerFactory, step: MpcStep) -> list[Marker]:
+        """Nothing besides the planned path of the mallet's joint."""
+        return []
+
+    def _receive(self, message: Odometry) -> None:
+        due = self._node.seconds(message.header.stamp, CONTACT_AHEAD)
+        if due < self._node.clock_seconds() - _LATE:
+            raise InvalidInputError("the contact is over")
+        plan = read_contact(message, self._node.time_base, self._config.base_frame)
+        mallet = np.concatenate([self._table.to_table(plan.position), plan.velocity])
+        self.contact = MalletContact(plan.stamp, mallet)
+        self._received, self._message = self._node.clock_seconds(), message
+
+    def _warm_up(self) -> None:
+        """Compile whatever a strike uses: wait at home, strike, return."""
+        planner = self.planner
+        q, still = planner.home, np.zeros(7)
+        contact = MalletContact(1.0, np.array([-0.55, 0.0, 1.0, 0.0]))
+        for index in range(4):
+            planner.accept(planner.step(0.02 * index, q, still, contact if index else None))
+        planner.accept(planner.step(0.1, q, still, None))
+        planner.stop(0.12)
+        planner.reset()
