@@ -170,8 +170,9 @@ def test_a_straight_strike_scores_and_is_described(world):
     assert result.end == GOAL and result.scored and result.banks == 0
     # Drag takes 0.5 /s times the way from the speed that the touch gives: 1.4 times the mallet's.
     assert result.goal_speed == pytest.approx(1.4 * 0.85 - 0.5 * 1.47, abs=0.1)
-    assert result.predicted == 0.9 and result.shot_speed == 0.85
-    assert abs(result.across) < 3e-3 and abs(result.along) < 0.02 and abs(result.speed_error) < 0.1
+    assert result.predicted == 0.9 and result.shot is INTENDED
+    along, across, speed_error = result.mallet_error
+    assert abs(across) < 3e-3 and abs(along) < 0.02 and abs(speed_error) < 0.1
     assert len(result.computing) == len(result.elapsed) == len(agent.observations)
     times = np.array([observation.time for observation in agent.observations])
     np.testing.assert_allclose(np.diff(times), 0.02, atol=1e-9)
@@ -222,7 +223,8 @@ def test_what_the_arm_does_not_strike_is_a_miss(world, monkeypatch, place, veloc
     monkeypatch.setattr(shooting_trials, "WITHOUT_TOUCH", 1.5)
     result = roll(world, place, velocity)
     assert result.end == end and not result.scored
-    assert math.isnan(result.predicted) and math.isnan(result.across) and result.touched == len(result.path)
+    assert math.isnan(result.predicted) and np.isnan(result.mallet_error).all()
+    assert result.mallet is None and result.touched == len(result.path)
 
 
 def test_a_goal_after_a_later_second_touch_is_another_shot(world, monkeypatch):
@@ -238,6 +240,14 @@ def test_motions_beyond_the_rules_are_counted(world):
     world.reset((*field.to_base([0.3, 0.4]), 0.0), (2.0, -0.2, 0.0), joints=joints)
     result = Trial(TASK, world, StandIn(world)).run()
     assert result.violations["height"] > 100
+
+
+def test_the_mallet_is_off_along_and_across_its_intended_motion():
+    diagonal = dataclasses.replace(INTENDED, angle=0.5 * math.pi)  # along +y
+    off = dataclasses.replace(
+        result("balanced", 0), shot=diagonal, mallet=diagonal.mallet + np.array([-0.001, 0.002, 0.1, 0.03])
+    )
+    np.testing.assert_allclose(off.mallet_error, [0.002, 0.001, 0.03], atol=1e-12)
 
 
 def test_banks_are_rims_between_touch_and_goal():
@@ -263,8 +273,10 @@ def test_a_trial_is_the_same_again():
 def result(name, seed, scored=True, predicted=0.9, speed=1.8, violations=None, step=2e-3):
     return ShotResult(
         ShotTask(name, seed), GOAL if scored else "never touched", speed if scored else NAN,
-        1 if scored and name == "forced_bank" else 0, predicted, 1e-3, 2e-3, 0.01, 1.5,
-        violations or {}, 0, np.full(50, step), np.full(50, 2 * step), np.zeros((3, 4)), 1,
+        1 if scored and name == "forced_bank" else 0,
+        None if math.isnan(predicted) else dataclasses.replace(INTENDED, goal=predicted),
+        INTENDED.mallet + np.array([2e-3, 1e-3, 0.01, 0.0]), violations or {}, 0,
+        np.full(50, step), np.full(50, 2 * step), np.zeros((3, 4)), 1,
     )  # fmt: skip
 
 
@@ -283,6 +295,7 @@ def test_the_summary_has_what_is_reported():
     row = summary["conservative"]
     assert row["score"] == 39 / 40 and row["misses"] == {"0": "never touched"}
     assert row["score_interval"][0] < 39 / 40 < row["score_interval"][1]
+    assert row["mallet_along_rms"] == pytest.approx(2e-3) and row["mallet_across_rms"] == pytest.approx(1e-3)
     assert row["predicted_mean"] == pytest.approx(0.9) and row["observed_of_predicted"] == 39 / 40
     assert "conservative 0: never touched" in table(summary)
 

@@ -40,35 +40,29 @@ class Player(Protocol):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShotResult:
-    """What came of a shot; NaN where there was none.
+    """What came of a shot.
 
     Attributes:
         task: which it was.
         end: "goal", or in words why there was none.
-        goal_speed: of the puck on the goal line, if it scored [m/s].
+        goal_speed: of the puck on the goal line, NaN if it did not score [m/s].
         banks: rims touched between touch and goal, if it scored.
-        predicted: probability of scoring at the last commitment.
-        across: how far the mallet was beside its intended place at the touch, left positive [m].
-        along: how far it was ahead of it [m].
-        speed_error: by how much it was faster than intended [m/s].
-        shot_speed: intended speed of the mallet [m/s].
+        shot: what was intended last before the touch, None if nothing was.
+        mallet: true state of the mallet's centre at the touch, table frame, shape (4,); None without one.
         violations: control cycles beyond limits of the arm ("limits") and against each rule that was broken.
         refused: trajectories that the arm's driver refused.
         computing: processor time of each step of the agent [s], shape (K,).
         elapsed: the same by the clock, shape (K,).
         path: true states of the puck at each step, shape (P, 4), table frame.
-        touched: index of the first of them after the touch.
+        touched: index of the first of them after the touch; P without one.
     """
 
     task: ShotTask
     end: str
     goal_speed: float
     banks: int
-    predicted: float
-    across: float
-    along: float
-    speed_error: float
-    shot_speed: float
+    shot: Shot | None
+    mallet: NDArray[np.float64] | None
     violations: dict[str, int]
     refused: int
     computing: NDArray[np.float64]
@@ -80,6 +74,23 @@ class ShotResult:
     def scored(self) -> bool:
         """Whether the puck is in the far goal."""
         return self.end == GOAL
+
+    @property
+    def predicted(self) -> float:
+        """Probability of scoring at the last commitment; NaN if there was none."""
+        return self.shot.goal if self.shot is not None else math.nan
+
+    @property
+    def mallet_error(self) -> NDArray[np.float64]:
+        """What the mallet was off at the touch, shape (3,), NaN without one.
+
+        Along its intended motion and across it, left positive [m]; of its speed [m/s].
+        """
+        if self.shot is None or self.mallet is None:
+            return np.full(3, np.nan)
+        c, s = math.cos(self.shot.angle), math.sin(self.shot.angle)
+        off = self.mallet - self.shot.mallet
+        return np.array([c * off[0] + s * off[1], c * off[1] - s * off[0], c * off[2] + s * off[3]])
 
 
 def trial(task: ShotTask) -> ShotResult:
@@ -119,17 +130,14 @@ class Trial:
         contacts = self.world.contacts
         while self.world.time < self._touch + WATCHED < math.inf:
             self._cycle()
-        scored = end == GOAL and goal is not None
-        shot, error = self._shot, self._errors()
+        scored = goal if end == GOAL else None
         return ShotResult(
             self.task, end,
-            goal_speed=float(np.hypot(*goal.velocity)) if scored and goal is not None else math.nan,
-            banks=banks(contacts, self._touch, goal.time) if scored and goal is not None else 0,
-            predicted=shot.goal if shot is not None else math.nan,
-            across=error[0], along=error[1], speed_error=error[2],
-            shot_speed=shot.speed if shot is not None else math.nan,
-            violations=self._violations(), refused=self._refused, computing=np.array(self._computing),
-            elapsed=np.array(self._elapsed), path=path, touched=touched or len(path),
+            goal_speed=float(np.hypot(*scored.velocity)) if scored is not None else math.nan,
+            banks=banks(contacts, self._touch, scored.time) if scored is not None else 0,
+            shot=self._shot, mallet=self._mallet, violations=self._violations(), refused=self._refused,
+            computing=np.array(self._computing), elapsed=np.array(self._elapsed), path=path,
+            touched=touched or len(path),
         )  # fmt: skip
 
     def _cycle(self) -> str:
@@ -188,15 +196,6 @@ class Trial:
             "never touched": not touched and now > self._began + WITHOUT_TOUCH,
         }
         return next((end for end, there in checks.items() if there), "")
-
-    def _errors(self) -> tuple[float, float, float]:
-        """Of the mallet at the touch: across and along its intended motion [m], and of its speed [m/s]."""
-        if self._shot is None or self._mallet is None:
-            return math.nan, math.nan, math.nan
-        normal = np.array([math.cos(self._shot.angle), math.sin(self._shot.angle)])
-        off = self._mallet - self._shot.mallet
-        across = float(normal[0] * off[1] - normal[1] * off[0])
-        return across, float(off[:2] @ normal), float(off[2:] @ normal)
 
     def _violations(self) -> dict[str, int]:
         broken = {"limits": self.world.limits.violations, **self.world.rules.report().violations}
