@@ -17,11 +17,7 @@ from typing import Any
 from sim_bridge.experiments.hockey import shooting_figures
 from sim_bridge.experiments.hockey.shooting_players import BASELINES, PLAYERS, player
 from sim_bridge.experiments.hockey.shooting_starts import SPREAD, ShotTask, world_of
-from sim_bridge.experiments.hockey.shooting_summary import (
-    missed_targets,
-    summarise,
-    table,
-)
+from sim_bridge.experiments.hockey.shooting_summary import missed_targets, summarise, table
 from sim_bridge.experiments.hockey.shooting_trials import ShotResult, trial
 from sim_bridge.experiments.runs import Execution, print_verdict, run_trials, write_summary
 

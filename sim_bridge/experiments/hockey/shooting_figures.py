@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.hockey.shooting_players import PLAYERS, puck_model, strike_table
+from sim_bridge.experiments.hockey.shooting_players import OBJECTIVES, PLAYERS, puck_model, strike_table
+from sim_bridge.experiments.hockey.shooting_summary import reliability
 from sim_bridge.experiments.hockey.shooting_trials import ShotResult
 from sim_bridge.hockey.recordings import TABLE
 from vpsto_ros.contact.puck import PuckModel
@@ -55,7 +56,8 @@ def write_chances(path: pathlib.Path) -> None:
             axes.plot(*way[:, :2].T, color="tab:blue" if good else "tab:red", lw=0.5, alpha=0.5)
         _disc(axes, PUCK[:2], TABLE.puck_radius, "tab:red")
         _disc(axes, mallet[:2], TABLE.mallet_radius, "tab:blue")
-        axes.set(title=f"{title}: predicted {chance:.2f}, {inside.mean():.2f} of {ROLLOUTS} rollouts")
+        goals = f"goals in {100 * inside.mean():.0f} % of {ROLLOUTS} rollouts"
+        axes.set_title(f"{title}\nchance {chance:.2f}, {goals}")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -119,27 +121,41 @@ def _arrows(shots: Sequence[Shot]) -> tuple[NDArray[np.float64], ...]:
 
 
 def write_shots(path: pathlib.Path, found: Sequence[ShotResult]) -> None:
-    """True ways of all pucks after the touch, or from the start if there was none."""
+    """True ways of all pucks after the touch, or from the start if there was none; and how chances held."""
     import matplotlib.pyplot as plt
 
     names = [name for name in PLAYERS if any(shot.task.name == name for shot in found)]
-    columns = min(len(names), 4)
-    rows = -(-len(names) // columns)
-    figure, panels = plt.subplots(
-        rows, columns, figsize=(4.6 * columns, 2.9 * rows), layout="constrained", squeeze=False
-    )
-    for axes in panels.ravel()[len(names) :]:
+    columns = min(len(names) + 1, 4)
+    rows = -(-(len(names) + 1) // columns)
+    size = 4.6 * columns, 2.9 * rows
+    figure, panels = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    for axes in panels.ravel()[len(names) + 1 :]:
         axes.axis("off")
     for axes, name in zip(panels.ravel(), names, strict=False):
-        chosen = sorted((shot for shot in found if shot.task.name == name), key=lambda shot: not shot.scored)
-        _draw_table(axes)
-        for shot in chosen:
-            way = shot.path[shot.touched :] if shot.touched < len(shot.path) else shot.path
-            axes.plot(*way[:, :2].T, color="tab:blue" if shot.scored else "tab:red", lw=0.6, alpha=0.6)
-        goals = sum(shot.scored for shot in chosen)
-        axes.set_title(f"{name}: {goals} of {len(chosen)} score")
+        _draw_ways(axes, name, [shot for shot in found if shot.task.name == name])
+    chosen = [shot for shot in found if shot.task.name in OBJECTIVES]
+    _draw_reliability(panels.ravel()[len(names)], reliability(chosen))
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _draw_ways(axes: Any, name: str, chosen: Sequence[ShotResult]) -> None:
+    _draw_table(axes)
+    for shot in sorted(chosen, key=lambda shot: not shot.scored):
+        way = shot.path[shot.touched :] if shot.touched < len(shot.path) else shot.path
+        axes.plot(*way[:, :2].T, color="tab:blue" if shot.scored else "tab:red", lw=0.6, alpha=0.6)
+    axes.set_title(f"{name}: {sum(shot.scored for shot in chosen)} of {len(chosen)} score")
+
+
+def _draw_reliability(axes: Any, rows: Sequence[dict[str, Any]]) -> None:
+    """Shares of goals among shots of about the same chance, with intervals."""
+    for row in rows:
+        axes.plot([row["predicted"]] * 2, row["interval"], color="tab:blue", lw=1)
+        axes.plot(row["predicted"], row["observed"], "o", color="tab:blue", ms=4)
+    axes.plot([0, 1], [0, 1], "k--", lw=0.8)
+    axes.set(xlabel="predicted chance", ylabel="share of goals", xlim=(0.45, 1.02), ylim=(-0.02, 1.02))
+    axes.set_title("all settings of the agent")
+    axes.grid(alpha=0.3)
 
 
 def _draw_table(axes: Any) -> None:
