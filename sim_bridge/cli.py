@@ -127,6 +127,9 @@ EXPERIMENTS = {
     "shooting_policy": Choice(
         "sim_bridge.experiments.hockey.shooting_policy",
         "the energy-based shooting policy and direct search",
+    "shooting": Choice(
+        "sim_bridge.experiments.hockey.shooting",
+        "the iiwa shoots pucks: score, speed, banks by setting",
     ),
     "goal_probability": Choice(
         "sim_bridge.experiments.hockey.goal_probability",
