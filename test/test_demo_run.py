@@ -99,8 +99,8 @@ from sim_bridge import cli
 from sim_bridge.demo import running
 delay, ready = float(sys.argv.pop(1)), running._wait_until_active
 
-def wait(observer, spinning, processes):
-    ready(observer, spinning, processes)
+def wait(observer, spinning, processes, script):
+    ready(observer, spinning, processes, script)
     if not delay:
         processes._processes["franka_driver"].kill()
         processes._processes["franka_driver"].wait()
@@ -109,7 +109,7 @@ def wait(observer, spinning, processes):
 
 def act(observer, original=running.Observer._act):
     original(observer)
-    if delay and observer._scenario.phase.start + delay < observer.simulated_time:
+    if delay and observer._script.scenario.phase.start + delay < observer.simulated_time:
         raise OSError("the disk is full")
 
 running._wait_until_active, running.Observer._act = wait, act
