@@ -111,6 +111,11 @@ class Observer(Node):
         message = self.latest(JOINT_STATES)
         return None if message is None else np.array(message.position)
 
+    def joint_velocity(self) -> NDArray[np.float64] | None:
+        """The newest joint velocities (n,) [rad/s], or None."""
+        message = self.latest(JOINT_STATES)
+        return None if message is None else np.array(message.velocity)
+
     def object_pose(self) -> NDArray[np.float64] | None:
         """The newest true pose of the object: x, y [m] and yaw [rad], or None."""
         message = self.latest(GROUND_TRUTH)
