@@ -126,13 +126,20 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
+    "goal_probability": Choice(
+        "sim_bridge.experiments.hockey.goal_probability",
+        "whether shots score as often as the puck model says",
+    ),
 }
 LEARNERS = {
     "puck_model": Choice("sim_bridge.learn.puck_model", "how an air-hockey puck floats, bounces and is hit"),
     "strikes": Choice("sim_bridge.learn.strikes", "in which posture the iiwa strikes a puck fastest"),
+    "shooting_policy": Choice(
+        "sim_bridge.learn.shooting_policy", "at which angle to shoot, from what direct search finds"
+    ),
 }
 
-LEARNED_FILES = {"puck_model": ".json", "strikes": ".npz"}
+LEARNED_FILES = {"puck_model": ".json", "strikes": ".npz", "shooting_policy": ".npz"}
 
 
 def positive(text: str) -> float:

@@ -9,6 +9,7 @@ from tqdm import tqdm
 from sim_bridge.cli import count
 from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import CONTACT_TIME, TABLE, Recorder, kind_of
+from vpsto_ros.contact.linear_gaussian import LinearGaussian
 from vpsto_ros.contact.puck import MODES, PuckModel
 from vpsto_ros.contact.puck_learning import LabelledSteps, collect, fit, widened, widening
 
@@ -75,8 +76,20 @@ def describe(model: PuckModel, factors: dict[str, float]) -> str:
         f"wall: keeps {keep[0]:.2f} of the speed across and {keep[1]:.2f} along it",
         f"mallet: {mallet:.2f} of the mallet's speed {puck:+.2f} of the puck's, {late:.1f} ms late",
     ]
+    if model.lively is not None:
+        lively = -model.lively.matrix[0, 0], model.lively.matrix[1, 1]
+        std["lively"] = model.lively.covariance.diagonal() ** 0.5
+        lines[1] += (
+            f"; {100 * model.lively_share:.0f} % of bounces are lively and keep {lively[0]:.2f} and "
+            f"{lively[1]:.2f}, scatter {1e3 * std['lively'][0]:.1f}, {1e3 * std['lively'][1]:.1f} mm/s"
+        )
     scatter = [
-        f"; scatter {1e3 * std[name][0]:.1f}, {1e3 * std[name][1]:.1f} mm/s, widened by {factors[name]:.2f}"
+        f"; scatter {1e3 * std[name][0]:.1f}, {1e3 * std[name][1]:.1f} mm/s{_growing(getattr(model, name))}, "
+        f"widened by {factors[name]:.2f}"
         for name in MODES
     ]
     return "\n".join(map("".join, zip(lines, scatter, strict=True)))
+
+
+def _growing(mode: LinearGaussian) -> str:
+    return f" at 1 m/s, {100 * mode.growth:g} % of the variance grows" if mode.growth else ""

@@ -12,8 +12,8 @@ from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import TABLE
 from vpsto_ros.planning.strikes import StrikeTable, tabulate
 
-X = np.linspace(-0.70, -0.20, 11)
-Y = np.linspace(-0.40, 0.40, 17)
+X = np.linspace(-0.75, -0.15, 13)
+Y = np.linspace(-0.44, 0.44, 17)
 ANGLE = np.deg2rad(np.linspace(-75.0, 75.0, 21))
 _IN_FRONT = np.deg2rad(30.0)  # shots that are nearly straight [rad]
 _ENOUGH = 0.9  # share of the places from which such a shot must be possible
@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "example: vpsto learn strikes --effort 1000 --out strikes.npz"
     parser.add_argument(
-        "--effort", type=count, default=20_000, metavar="N",
-        help="postures that are tried per place and direction (default 20000)",
+        "--effort", type=count, default=8_000, metavar="N",
+        help="postures that are tried per place and direction (default 8000)",
     )  # fmt: skip
 
 
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     began = time.perf_counter()
     table = tabulate(
         X, Y, ANGLE, TABLE.contact_distance, np.random.default_rng(arguments.seed), effort=arguments.effort,
-        progress=lambda entries: tqdm(list(entries), desc="searching postures", disable=None),
+        progress=lambda entries: tqdm(entries, desc="searching postures", disable=None),
     )  # fmt: skip
     path = pathlib.Path(arguments.out)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
 def reachable(table: StrikeTable) -> float:
     """Share of the places from which some nearly straight shot is possible."""
     straight = np.abs(table.angle) <= _IN_FRONT
-    return float((table.speed[:, :, straight].max(axis=2) > 0.0).mean())
+    return float((table.speed[..., straight].max(axis=(0, 3)) > 0.0).mean())
 
 
 def describe(table: StrikeTable) -> str:

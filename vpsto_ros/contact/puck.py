@@ -161,7 +161,8 @@ class PuckModel:
         Raises:
             InvalidInputError: the shapes do not fit, or a time is negative or not finite.
         """
-        means, covariances = self._states(np.asarray(mean, dtype=float)[None], np.asarray(covariance, dtype=float)[None])
+        first, spreads = np.asarray(mean, dtype=float)[None], np.asarray(covariance, dtype=float)[None]
+        means, covariances = self._states(first, spreads)
         ahead = np.asarray(times, dtype=float)
         if ahead.ndim != 1 or not (np.isfinite(ahead) & (ahead >= 0.0)).all():
             raise InvalidInputError("expected times (K,) from 0 on")

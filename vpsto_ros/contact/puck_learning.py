@@ -3,12 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.contact.linear_gaussian import LinearGaussian
-from vpsto_ros.contact.puck import HockeyTable, PuckModel, contact_frames
+from vpsto_ros.contact.puck import APPROACH, HockeyTable, PuckModel, contact_frames
+from vpsto_ros.contact.two_kinds import TwoKinds, fit_two_kinds
 from vpsto_ros.exceptions import InvalidInputError
 
 FLOATING, WALL, MALLET, UNCLEAR = 0, 1, 2, -1
@@ -155,14 +157,23 @@ def collect(
 def fit(steps: LabelledSteps, table: HockeyTable) -> PuckModel:
     """The model of labelled steps, (5.4)-(5.5).
 
+    Deviations: how much the scatter of bounces and hits grows with the speed of approach is fitted too, and
+    bounces may be of two kinds (:mod:`vpsto_ros.contact.two_kinds`).
+
     Raises:
         InvalidInputError: a mode was seen too rarely.
     """
-    floating = _fit(FLOATING, steps.outputs[FLOATING], steps.inputs[FLOATING])
-    wall = _fit(WALL, *_mirrored(steps.outputs[WALL], steps.inputs[WALL]))
+    floating = _fit(FLOATING, steps.outputs[FLOATING], steps.inputs[FLOATING], LinearGaussian.fit)
+    wall = _fit(
+        WALL, *_mirrored(steps.outputs[WALL], steps.inputs[WALL]), fit_two_kinds, copies=2,
+        approach=np.array(APPROACH["wall"]),
+    )
     after = velocities_at_touch(steps, floating)
-    mallet = _fit(MALLET, *_mirrored(after, steps.inputs[MALLET]))
-    return PuckModel(table, steps.period, floating, wall, mallet, _delay(steps, after))
+    mallet = _fit(
+        MALLET, *_mirrored(after, steps.inputs[MALLET]), LinearGaussian.fit, approach=APPROACH["mallet"]
+    )
+    delay = _delay(steps, after)
+    return PuckModel(table, steps.period, floating, wall.usual, mallet, delay, wall.rare, wall.share)
 
 
 def widening(
@@ -197,17 +208,23 @@ def widening(
 
 
 def step_distances(steps: LabelledSteps, model: PuckModel) -> dict[int, NDArray[np.float64]]:
-    """Squared Mahalanobis distances (N,) of steps from what a model expects of them, by mode."""
+    """Squared Mahalanobis distances (N,) of steps from what a model expects of them, by mode.
+
+    A bounce counts as one of the kind that it likely was, usual or lively.
+    """
     outputs = {**steps.outputs, MALLET: velocities_at_touch(steps, model.floating)}
-    return {
-        mode: getattr(model, name).distances(outputs[mode], steps.inputs[mode])
-        for mode, name in _NAMES.items()
-    }
+    modes: dict[int, LinearGaussian | TwoKinds] = {
+        FLOATING: model.floating, WALL: TwoKinds(model.wall, model.lively, model.lively_share),
+        MALLET: model.mallet,
+    }  # fmt: skip
+    return {mode: modes[mode].distances(outputs[mode], steps.inputs[mode]) for mode in _NAMES}
 
 
 def widened(model: PuckModel, factors: Mapping[str, float]) -> PuckModel:
     """A model with other standard deviations, by factors for its modes."""
     modes = {name: getattr(model, name).widened(factor) for name, factor in factors.items()}
+    if model.lively is not None:
+        modes["lively"] = model.lively.widened(factors["wall"])
     return dataclasses.replace(model, **modes)
 
 
@@ -228,9 +245,9 @@ def _delay(steps: LabelledSteps, after: NDArray) -> float:
     return max(0.0, float(((straight - steps.advance) * jump).sum() / (jump * jump).sum()))
 
 
-def _fit(mode: int, outputs: NDArray, inputs: NDArray) -> LinearGaussian:
+def _fit(mode: int, outputs: NDArray, inputs: NDArray, fitted: Callable[..., Any], **options: Any) -> Any:
     try:
-        return LinearGaussian.fit(outputs, inputs, least_std=1e-4)
+        return fitted(outputs, inputs, least_std=1e-4, **options)
     except InvalidInputError as error:
         raise InvalidInputError(
             f"the {_NAMES[mode]} mode cannot be learned from {len(outputs)} steps: {error}"

@@ -1,4 +1,4 @@
-"""An agent that shoots at air hockey: filter, contact planner and MPC in one, for any simulator or robot (ch. 5).
+"""An agent that shoots at air hockey (ch. 5): filter, contact planner and MPC in one, for any robot.
 
 It needs neither ROS nor a simulator. What it is given and what it returns is in the robot's base frame.
 
@@ -161,7 +161,7 @@ class HockeyAgent:
         Nothing that a camera delivers raises: what is wrong with it is ignored, and the message says so.
 
         Raises:
-            InvalidInputError: the joint state is not 7 finite positions and velocities, or time is not finite.
+            InvalidInputError: the joint state is not 7 finite positions and velocities, or time not finite.
         """
         now = float(observation.time)
         q = np.array(observation.joint_position, dtype=float)
@@ -174,7 +174,7 @@ class HockeyAgent:
         contact = MalletContact(shot.time, shot.mallet) if shot is not None else None
         step = self.mpc.step(now, q, qd, contact)
         if shot is not None and not step.valid:
-            self.planner.forget()
+            self.planner.refuse()
             complaints.append(f"shot refused: {step.message}")
         self.mpc.accept(step)
         reasons = complaints if shot is not None else [*complaints, self.planner.reason]

@@ -23,6 +23,9 @@ from vpsto_ros.planning.shooting_times import ContactTimes, Round
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
 
+_ALIKE = (0.03, 0.15)  # times [s] and directions [rad] of shots that are much alike
+_REMEMBERED = 8  # shots that were refused
+_SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
 _TURNS = np.array([0.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0])  # of a chosen angle in a step, of the largest
 
 
@@ -63,14 +66,25 @@ class ShootingPlanner:
         self.search = ShotSearch(model, strikes, self.config)
         self._times = ContactTimes(self.search, policy, self._rng)
         self.committed: Shot | None = None
+        self._barred: list[Shot] = []
         self.forget()
 
     def forget(self) -> None:
         """Drop the shot and begin to search anew."""
         self.committed, self.reason = None, "contact times are being searched"
+        self._before: Shot | None = None
         self._share = 1.0  # of the largest speed that the chosen shot has
         self._round: Round | None = None
         self._samples: PolicySamples | None = None
+
+    def refuse(self) -> None:
+        """The arm cannot do the chosen shot: back to the one before, if any, and never that again."""
+        shot, before = self.committed, self._before
+        self.forget()
+        if shot is not None:
+            self._barred = [*self._barred[-_REMEMBERED:], shot]
+        if before is not None:
+            self._commit(before)
 
     def plan(self, now: float, puck: PuckState | None, joints: ArrayLike) -> Shot | None:
         """A step of the planner.
@@ -128,7 +142,7 @@ class ShootingPlanner:
         """Weigh the shot anew for what is now known of the puck; what speaks against it, else empty."""
         ahead = np.array([max(shot.time - puck.stamp, 0.0)])
         mean, covariance = self.search.model.predict(puck.mean, puck.covariance, ahead)
-        _, (_, objection) = self._times.places(mean, covariance)
+        _, (_, objection) = self._times.places(mean, covariance, chosen=True)
         if objection:
             return objection
         if math.dist(mean[0, :2], shot.puck[:2]) > self.config.largest_jump:
@@ -182,7 +196,7 @@ class ShootingPlanner:
             self._round = self._times.begin(now)
         current = self._round
         shot = self._times.advance(current, now, puck, joints)
-        if shot is not None and self.search.taken(shot):
+        if shot is not None and self.search.taken(shot) and not self._is_barred(shot):
             current.shots.append(shot)
             if self.committed is not None and self._clearly_better(shot, self.committed):
                 self._commit(shot)
@@ -203,8 +217,8 @@ class ShootingPlanner:
         """Choose the best shot of a round that is still possible."""
         reason = finished.objection[1]
         for shot in sorted(finished.shots, key=self._worth, reverse=True):
-            lead = self.search.strikes.lead(joints, shot.puck[None, :2], np.array([shot.angle]))
-            if lead[0] > shot.time - now:
+            there, ahead = (shot.puck[None, :2], np.array([shot.angle])), np.array([shot.time - now])
+            if self.search.strikes.timely_speeds(joints, *there, ahead)[0] < _SPEED_LEFT * shot.speed:
                 reason = "the arm cannot be there in time"
                 continue
             self._commit(shot)
@@ -213,7 +227,15 @@ class ShootingPlanner:
                 return
         self._drop(reason)
 
+    def _is_barred(self, shot: Shot) -> bool:
+        """Whether it is much like one that the arm has refused."""
+        return any(
+            abs(shot.time - other.time) < _ALIKE[0] and abs(shot.angle - other.angle) < _ALIKE[1]
+            for other in self._barred
+        )
+
     def _commit(self, shot: Shot) -> None:
+        self._before = self.committed
         largest = float(self.search.speeds(shot.puck[None, :2], np.array([shot.angle]))[0])
         self._share = shot.speed / largest if largest > 0.0 else 1.0
         self.committed, self.reason, self._samples = shot, "", None

@@ -13,25 +13,28 @@ from vpsto_ros.exceptions import ConfigurationError
 
 
 class Strikes(Protocol):
-    """What the arm can do: largest speeds (5.13) of the mallet along its direction, and the time they need.
+    """What the arm can do: largest speeds (5.13) of the mallet along its motion, and the time they need."""
 
-    Attributes:
-        x: uniform grid of the puck's place at the touch, table frame [m].
-        y: likewise.
-        angle: uniform grid of the direction of the mallet's velocity, from +x [rad].
-    """
+    @property
+    def x(self) -> NDArray[np.float64]:
+        """Uniform grid of the puck's place at the touch, table frame [m]."""
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    angle: NDArray[np.float64]
+    @property
+    def y(self) -> NDArray[np.float64]:
+        """Likewise."""
+
+    @property
+    def angle(self) -> NDArray[np.float64]:
+        """Uniform grid of the direction of the mallet's velocity, from +x [rad]."""
 
     def speeds(self, puck: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Largest speeds (B,) [m/s] at places of the puck (B, 2) in directions (B,); 0 where none is."""
 
-    def lead(
-        self, joints: NDArray[np.float64], puck: NDArray[np.float64], angles: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Least times (B,) [s] from a posture at rest (7,) into such touches."""
+    def timely_speeds(
+        self, joints: NDArray[np.float64], puck: NDArray[np.float64], angles: NDArray[np.float64],
+        available: NDArray[np.float64],
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """Largest speeds (B,) [m/s] that can be had from a posture at rest (7,) in the times (B,) [s]."""
 
 
 @documented
@@ -143,7 +146,7 @@ class ShootingConfig:
     time_step: float = option(0.05, "between contact times", unit="s", minimum=0.005, maximum=1.0)
     latest: float = option(2.5, "how far ahead the last contact time is", unit="s", minimum=0.1, maximum=10.0)
     times_per_step: int = option(
-        5, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
+        12, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
         maximum=1000,
     )  # fmt: skip
     policy_times_per_step: int = option(

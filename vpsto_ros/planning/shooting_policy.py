@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
 FORMAT = "vpsto_ros shooting policies 1"
-SHIPPED = pathlib.Path(__file__).parent / "models" / "shooting.npz"
+SHIPPED = pathlib.Path(__file__).parent / "models" / "shooting_policy.npz"
 """The policies of the three settings, which come with the package; their origin is in the file."""
 HIDDEN = 128
 LAYERS = ("first", "first_bias", "second", "second_bias", "last")
@@ -69,7 +69,7 @@ class EnergyModel:
             raise InvalidInputError(f"layers of an energy model have the shapes {shapes}")
         if np.shape(self.low) != (5,) or np.shape(self.high) != (5,):
             raise InvalidInputError("the range of an energy model's inputs needs five numbers each")
-        arrays = [self.low, self.high, *self.weights.values()]
+        arrays: list[NDArray] = [self.low, self.high, *self.weights.values()]
         if not all(np.isfinite(array).all() for array in arrays) or not (self.high > self.low).all():
             raise InvalidInputError("numbers of an energy model are not finite, or its range is empty")
 
@@ -95,8 +95,8 @@ class EnergyModel:
     def angle_inputs(self, angles: ArrayLike) -> NDArray[np.float32]:
         """Angles (...,) scaled, and their sines and cosines, shape (..., 1 + 2 H)."""
         u = self._scaled(np.asarray(angles, dtype=float), 4)
-        multiples = np.arange(1, (len(self.weights["first"]) - 3) // 2, dtype=np.float32)
-        phases = np.multiply.outer(u, np.float32(np.pi) * multiples)
+        multiples: NDArray[np.float32] = np.pi * np.arange(1, (len(self.weights["first"]) - 3) // 2)
+        phases = u[..., None] * multiples.astype(np.float32)
         return np.concatenate([u[..., None], np.sin(phases), np.cos(phases)], axis=-1)
 
     def energies(self, state: ArrayLike, angles: ArrayLike) -> NDArray[np.float32]:

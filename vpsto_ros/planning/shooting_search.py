@@ -56,8 +56,13 @@ class ShotSearch:
         self._mallet_reach = np.array([table.half_length, table.half_width]) - table.mallet_radius
 
     def speeds(self, puck: NDArray, angles: NDArray) -> NDArray[np.float64]:
-        """Largest speeds (B,) at places (B, 2); 0 where the arm cannot strike or the mallet has no room."""
-        return np.where(self.fits(puck, angles), self.strikes.speeds(puck, angles), 0.0)
+        """Largest speeds (B,) at places (B, 2); 0 where the arm cannot strike or the mallet has no room.
+
+        Beside the grid of strikes they are those at its edge; callers say how far that may be.
+        """
+        grid = self.strikes
+        nearest = np.clip(puck, [grid.x[0], grid.y[0]], [grid.x[-1], grid.y[-1]])
+        return np.where(self.fits(puck, angles), grid.speeds(nearest, angles), 0.0)
 
     def fits(self, puck: NDArray, angles: NDArray) -> NDArray[np.bool_]:
         """Whether there is room (B,) for the mallet behind the puck, and on its way there."""
@@ -82,7 +87,7 @@ class ShotSearch:
         covariance = strokes.covariance.copy()
         covariance[:, :2, :2] += self.config.aim_std**2 * tangent[:, :, None] * tangent[:, None, :]
         by_puck, by_mallet = self.model.mallet.matrix[0, [0, 2]]  # of the speed along the normal
-        speed_std = self.config.speed_std * by_mallet / by_puck
+        speed_std = self.config.speed_std * by_mallet / max(abs(by_puck), 1e-6)
         covariance[:, 2:, 2:] += speed_std**2 * normal[:, :, None] * normal[:, None, :]
         return self.model.shots(strokes.puck, covariance, mallet)
 
@@ -152,8 +157,10 @@ class ShotSearch:
         """Strokes around some of a grid, with every share of the largest speed."""
         low, high = self.strikes.angle[0], self.strikes.angle[-1]
         angles = np.clip(grid.angle[rows][:, None] + self._around, low, high).ravel()
-        rows = np.repeat(rows, len(self._around))
-        largest = self.speeds(grid.puck[rows, :2], angles)
+        # Where time is short the speeds of the grid are less than the largest.
+        share = grid.speed[rows] / self.strikes.speeds(grid.puck[rows, :2], grid.angle[rows])
+        share, rows = np.repeat(share, len(self._around)), np.repeat(rows, len(self._around))
+        largest = share * self.speeds(grid.puck[rows, :2], angles)
         angle = np.tile(angles, len(self._shares))
         speed = np.outer(self._shares, largest).ravel()
         rows = np.tile(rows, len(self._shares))

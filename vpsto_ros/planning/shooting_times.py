@@ -16,6 +16,8 @@ Objection = tuple[int, str]
 """What rules a shot out, and how far it had come until then; the farthest one is told."""
 NO_OBJECTION: Objection = (-1, "")
 _SOONEST = 0.05  # no touch is planned so soon [s]
+_SURE = 2.0  # standard deviations of its place by which a puck must be within reach
+_BEYOND = 0.01  # how far beyond the reach a chosen shot may get [m]
 _RIM = 0.02  # estimates of a puck at a rim may be so far in it [m]
 _AT_REST = 0.03  # slower pucks do not move away [m/s]
 
@@ -111,22 +113,32 @@ class ContactTimes:
         possible = (largest > 0.0) & (speeds[slots, near] > 0.0)
         if not possible.any():
             return None
-        slots, angles, largest = slots[possible], angles[possible], largest[possible]
+        slots, angles, near = slots[possible], angles[possible], near[possible]
+        # Where time is short the speeds of the grid are less than the largest.
+        share = speeds[slots, near] / self.search.strikes.speeds(means[slots, :2], self.search.angles[near])
+        largest = share * largest[possible]
         strokes = Strokes(times[slots], means[slots], covariances[slots], angles, largest)
         outlook = self.search.outlook(strokes)
         return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes.time, outlook))))
 
-    def places(self, means: NDArray, covariances: NDArray) -> tuple[NDArray, Objection]:
-        """At which contact times (K,) the puck is where it could be struck, and the objection if at none."""
+    def places(
+        self, means: NDArray, covariances: NDArray, *, chosen: bool = False
+    ) -> tuple[NDArray, Objection]:
+        """At which contact times (K,) the puck is where it could be struck, and the objection if at none.
+
+        It must be there for all that is known; a shot that has been chosen may be a little beyond the reach.
+        """
         x, y, vx = means[:, 0], means[:, 1], means[:, 2]
+        inside = [-_BEYOND if chosen else _SURE * np.sqrt(covariances[:, i, i]) for i in (0, 1)]
         std, largest = _largest_std(covariances), self.search.config.largest_std
-        far, close = x > self._high[0], x < self._low[0]
+        far, close = x > self._high[0] - inside[0], x < self._low[0] + inside[0]
+        beside = (y < self._low[1] + inside[1]) | (y > self._high[1] - inside[1])
         checks = [
             (~np.logical_or.accumulate(self.off_table(means)), "the puck is leaving the table"),
             (~np.logical_or.accumulate(far & (vx > _AT_REST)), "the puck is out of reach and moves away"),
             (~far, "the puck is out of the arm's reach"),
             (~close, "the puck is behind where the mallet can strike"),
-            ((y >= self._low[1]) & (y <= self._high[1]), "the puck is too near to a side wall"),
+            (~beside, "the puck is too near to a side wall"),
             (std <= largest, f"where the puck will be is uncertain by {1e3 * std.min():.0f} mm"),
         ]
         return _narrowed(np.ones(len(means), dtype=bool), checks, 0)
@@ -155,14 +167,13 @@ class ContactTimes:
             ],
             6,
         )
-        timely = there.copy()
-        rows = np.flatnonzero(there)
+        rows, timely = np.flatnonzero(there), np.zeros(len(puck))
         if rows.size:
-            lead = self.search.strikes.lead(joints, puck[rows], angles[rows]) + self.search.config.lead_margin
-            timely[rows] = lead <= np.repeat(available, shape[1])[rows]
+            spare = np.repeat(available, shape[1])[rows] - self.search.config.lead_margin
+            timely[rows] = self.search.strikes.timely_speeds(joints, puck[rows], angles[rows], spare)
             if not timely.any():
                 objection = (9, "the arm cannot be there in time")
-        return np.where(timely, speeds, 0.0).reshape(shape), there.reshape(shape), objection
+        return timely.reshape(shape), there.reshape(shape), objection
 
     def _fresh(self, current: Round, places: NDArray, possible: NDArray) -> NDArray[np.bool_]:
         """Which of the possible directions (K, A) have not been searched at nearly the same place (K, 2)."""

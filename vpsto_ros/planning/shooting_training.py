@@ -29,7 +29,7 @@ class TrainingConfig:
     velocity_std: float = option(
         0.01, "and likewise their velocities", unit="m/s", minimum=0.0, maximum=1.0
     )
-    epochs: int = option(500, "passes over the states", minimum=1, maximum=10**5)
+    epochs: int = option(60, "passes over the states", minimum=1, maximum=10**5)
     batch: int = option(50, "states per step of Adam", minimum=1, maximum=10**5)
     negatives: int = option(
         31, "counter-examples of a state that a pass draws of its M - 1", minimum=1, maximum=10**4

@@ -19,7 +19,7 @@ from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
 from vpsto_ros.planning.play_motions import ArmState, Play, PlayMotion
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import extended, resting
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.strikes import Cell, StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.robot.mallet_tilt import MalletTilt
@@ -163,7 +163,7 @@ class StrikeMpc(ReferencePlanner):
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
         self.contact: MalletContact | None = None
-        self._cell: tuple[int, int, int] | None = None
+        self._cell: Cell | None = None
         self._approach.accept(None)
         self._return.accept(None)
 
@@ -286,10 +286,13 @@ class StrikeMpc(ReferencePlanner):
     def _strike(self, now: float, takeover: float, contact: MalletContact) -> MpcStep:
         """Plan into the touch, on, and home."""
         fresh = not contact.continues(self.contact)
-        cell = self.table.cell(contact.mallet) if fresh or self._cell is None else self._cell
+        cell = self._cell
+        if fresh or cell is None:
+            cell = self.table.cell(contact.mallet, self._running(now))
         if cell is None:
-            return self._refuse(now, takeover, fresh, "there is no strike in the table for this contact")
+            return self._refuse(now, "there is no strike in the table for this contact")
         begin = self._begin(takeover, contact, fresh)
+        before = self._approach.previous, self._return.previous
         if fresh:
             self._approach.accept(None)
             self._return.accept(None)
@@ -298,14 +301,16 @@ class StrikeMpc(ReferencePlanner):
             for _ in range(self.config.first_rounds - 1 if fresh else 0):
                 result, whole = self._through(now, begin, cell, contact, whole)
         except InfeasibleError as error:
-            return self._refuse(now, takeover, fresh, str(error))
+            self._approach.accept(before[0])
+            self._return.accept(before[1])
+            return self._refuse(now, str(error))
         self.contact, self._cell = contact, cell
         iterations = result.search.iterations if result.search is not None else 0
         path = self._tool(whole(np.linspace(whole.start_time, whole.end_time, 40)))
         return MpcStep(whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path)
 
     def _through(
-        self, now: float, begin: ArmState, cell: tuple[int, int, int], contact: MalletContact,
+        self, now: float, begin: ArmState, cell: Cell, contact: MalletContact,
         motion: Trajectory | None,
     ) -> tuple[OnlineResult, Trajectory]:  # fmt: skip
         """The running motion, one from it into a touch, and the one after that.
@@ -329,11 +334,9 @@ class StrikeMpc(ReferencePlanner):
         self._approach.accept(result.trajectory)
         return result, self._joined(now, result.trajectory.followed_by(onwards))
 
-    def _refuse(self, now: float, takeover: float, fresh: bool, why: str) -> MpcStep:
-        """Go on with a contact that has been planned before; with a new one, do without."""
-        withdraw = fresh and self.contact is not None
-        step = self._withdraw(now, takeover) if withdraw else self._go_on(now)
-        return dataclasses.replace(step, valid=False, message=why)
+    def _refuse(self, now: float, why: str) -> MpcStep:
+        """Go on with what runs: it is whole, and ends at home."""
+        return dataclasses.replace(self._go_on(now), valid=False, message=why)
 
     def _begin(self, takeover: float, contact: MalletContact, fresh: bool) -> ArmState:
         """Where planning begins: at the takeover, or later while there is time to wait."""
@@ -346,7 +349,7 @@ class StrikeMpc(ReferencePlanner):
         return ArmState(start, position, velocity)
 
     def _target(
-        self, cell: tuple[int, int, int], contact: MalletContact, now: float, motion: Trajectory | None
+        self, cell: Cell, contact: MalletContact, now: float, motion: Trajectory | None
     ) -> ArmState:
         """The arm's state at the touch, with the mallet swinging as a motion much like it makes it.
 

@@ -25,7 +25,7 @@ _NEAR_ZERO = 1e-9
 HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT, RUN_UP, HOLD, BRAKE, LEAD_WEIGHT = range(10)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def fastest(jac, ex, ey, limits, rates):
     """Largest v with v (ex, ey, 0) = J qd and |qd| <= limits, (5.13), with the joint rates that give it.
 
@@ -63,7 +63,7 @@ def fastest(jac, ex, ey, limits, rates):
     return _primal(jac, ex, ey, limits, rates, best, first, second, bx, by, bz)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _primal(jac, ex, ey, limits, rates, best, first, second, lx, ly, lz):
     """Rates at the optimum: joints with a part in the dual at their limits, the pair makes up the rest."""
     rx, ry, rz = best * ex, best * ey, 0.0
@@ -87,10 +87,10 @@ def _primal(jac, ex, ey, limits, rates, best, first, second, lx, ly, lz):
     off += abs(ry - jac[1, first] * rates[first] - jac[1, second] * rates[second])
     off += abs(rz - jac[2, first] * rates[first] - jac[2, second] * rates[second])
     # Where joints do the same (their planes coincide) the pair may not do: such a posture is passed over.
-    return best if worst < 1.0 + 1e-6 and off < 1e-6 else 0.0
+    return best if worst < 1.0 + 1e-6 and off < 1e-6 else 0.0  # also where numbers are not finite
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def straighten(q, rates, jac, curvature, probe, points, axes, other):
     """The least joint acceleration per s^2, kappa (7,), that keeps the universal joint on its line."""
     for k in range(7):
@@ -106,7 +106,7 @@ def straighten(q, rates, jac, curvature, probe, points, axes, other):
     add_least_motion(jac, -cx / _DIFFERENCE, -cy / _DIFFERENCE, -cz / _DIFFERENCE, curvature)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _overspeed(rates, curvature, limits, rules):
     """Largest share of the velocity limits on the way, at least 1."""
     begin, hold, end = -0.5 * rules[RUN_UP], rules[HOLD], rules[HOLD] + 0.5 * rules[BRAKE]
@@ -124,7 +124,7 @@ def _overspeed(rates, curvature, limits, rules):
     return worst
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _breaches(q, rates, curvature, positions, rules, probe, points, axes):
     """How far a strike leaves the plane, the place or the postures that are allowed, weighed [m/s]."""
     begin, end = -0.5 * rules[RUN_UP], rules[HOLD] + 0.5 * rules[BRAKE]
@@ -143,7 +143,7 @@ def _breaches(q, rates, curvature, positions, rules, probe, points, axes):
     return cost
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def rate_posture(q, angle, limits, positions, rules, home, rates, curvature, work):
     """Score of a posture whose universal joint is in place: speed, less breaches and the way from home.
 
@@ -181,7 +181,7 @@ def rate_posture(q, angle, limits, positions, rules, home, rates, curvature, wor
     return speed - breaches - rules[LEAD_WEIGHT] * lead, speed, breaches
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def search_posture(x, y, angle, limits, positions, rules, home, seeds, noise, refined, posture, rates):
     """The best posture for a strike with the universal joint at (x, y): random starts, the best refined.
 
@@ -200,7 +200,7 @@ def search_posture(x, y, angle, limits, positions, rules, home, seeds, noise, re
         rates: output (7,).
 
     Returns:
-        speed [m/s], breaches.
+        score, speed [m/s], breaches.
     """
     work = (np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6)), np.empty((3, 6)), np.empty(7))
     points, axes, jac = work[0], work[1], work[2]
@@ -232,6 +232,5 @@ def search_posture(x, y, angle, limits, positions, rules, home, seeds, noise, re
             best = score
             posture[:] = q
     if best == _BAD:
-        return 0.0, np.inf
-    result = rate_posture(posture, angle, limits, positions, rules, home, rates, curvature, work)
-    return result[1], result[2]
+        return _BAD, 0.0, np.inf
+    return rate_posture(posture, angle, limits, positions, rules, home, rates, curvature, work)

@@ -7,10 +7,11 @@ up and moved to the exact place.
 """
 
 import dataclasses
+import functools
+import itertools
 import json
 import math
 import pathlib
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,11 @@ from vpsto_ros.planning.strike_search import search_posture
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import add_least_motion, move_to
 
-FORMAT = "vpsto_ros strikes 1"
+FORMAT = "vpsto_ros strikes 2"
 SHIPPED = pathlib.Path(__file__).parent / "models" / "strikes.npz"
 """The table of the iiwa at the air-hockey table, which comes with the package; its origin is in the file."""
+Cell = tuple[int, int, int, int]
+"""An entry: layer, and indices of x, y and angle."""
 _MIRROR = np.array([-1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])  # of the joints, across the plane y = 0
 _LEAST_SPEED = 0.2  # slower strikes are none [m/s]
 _LARGEST_BREACH = 0.05  # what the search may leave of breaches [m/s]; planned motions are checked themselves
@@ -49,9 +52,14 @@ class StrikeConfig:
         maximum=0.5,
     )  # fmt: skip
     brake: float = option(0.15, "time in which they come to rest", unit="s", minimum=0.11, maximum=1.0)
-    lead_weight: float = option(
-        0.5, "price of a posture far from home, per second that its quickest joint motion takes",
+    lead_weights: tuple[float, ...] = option(
+        (0.5, 1.2, 3.0), "price of postures far from home, per second that the quickest joint motion to them"
+        " takes; for each a layer of the table: fast strikes first, then ones that are soon there",
         unit="m/s²", minimum=0.0, maximum=10.0,
+    )  # fmt: skip
+    lead_factor: float = option(
+        1.3, "time from rest into the run-up as a multiple of the way over the largest velocity", minimum=1.0,
+        maximum=3.0,
     )  # fmt: skip
     speed_share: float = option(
         0.97, "share of the planned velocity limits in a strike: what replanning needs", minimum=0.1,
@@ -64,14 +72,14 @@ class StrikeConfig:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StrikeTable:
-    """Postures at the touch over a grid of puck positions (table frame) and shooting angles.
+    """Postures at the touch over a grid of puck positions (table frame) and shooting angles, in L layers.
 
     Attributes:
         x, y: uniform grids of the puck's centre at the touch, table frame [m].
         angle: uniform grid of the direction of the mallet's motion, from +x [rad].
-        speed: largest speed of the mallet, shape (X, Y, A) [m/s]; 0 where there is no strike.
-        posture: joint positions at the touch with the universal joint above the mallet, (X, Y, A, 7) [rad].
-        rates: joint velocities there at that speed, (X, Y, A, 7) [rad/s].
+        speed: largest speed of the mallet, shape (L, X, Y, A) [m/s]; 0 where there is no strike.
+        posture: joint positions at the touch, the universal joint above the mallet, (L, X, Y, A, 7) [rad].
+        rates: joint velocities there at that speed, (L, X, Y, A, 7) [rad/s].
         contact_distance: between the centres of puck and mallet when they touch [m].
         config: how strikes run.
         rules: what they keep.
@@ -91,10 +99,10 @@ class StrikeTable:
     rules: PlayRules = dataclasses.field(default_factory=PlayRules)
 
     def __post_init__(self) -> None:
-        shape = (len(self.x), len(self.y), len(self.angle))
+        shape = (len(self.config.lead_weights), len(self.x), len(self.y), len(self.angle))
         for name in ("x", "y", "angle", "speed", "posture", "rates"):
             array = np.ascontiguousarray(getattr(self, name), dtype=float)
-            expected = {"x": shape[:1], "y": shape[1:2], "angle": shape[2:], "speed": shape}.get(
+            expected = {"x": shape[1:2], "y": shape[2:3], "angle": shape[3:], "speed": shape}.get(
                 name, (*shape, 7)
             )
             if array.shape != expected or not np.isfinite(array).all():
@@ -117,30 +125,95 @@ class StrikeTable:
 
         Trilinear between the entries of the table; 0 outside of it and next to an entry without a strike.
         """
+        return self._layers(puck, angles).max(axis=0)
+
+    def timely_speeds(
+        self, joints: ArrayLike, puck: ArrayLike, angles: ArrayLike, available: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Largest mallet speeds (B,) [m/s] of the strikes that can be reached in time.
+
+        Args:
+            joints: where the arm is at rest, shape (7,) [rad].
+            puck: positions at the touch, table frame, shape (B, 2) [m].
+            angles: shape (B,) [rad].
+            available: until the touch, shape (B,) [s].
+        """
+        timely = self._leads(joints, puck, angles) <= np.asarray(available, dtype=float)
+        return np.where(timely, self._layers(puck, angles), 0.0).max(axis=0)
+
+    def lead(self, joints: ArrayLike, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
+        """Least times (B,) [s] from joints (7,) at rest to the touch of pucks (B, 2) at angles (B,).
+
+        The joints go to the start of the run-up on a smooth curve, and from there into the strike; inf
+        without a strike.
+        """
+        return self._leads(joints, puck, angles).min(axis=0)
+
+    def cell(self, mallet: ArrayLike, joints: ArrayLike) -> Cell | None:
+        """The entry for a state (4,) of the mallet at the touch, table frame; None without a strike.
+
+        Of the layers that are as fast as that, the one that is soonest reached from joints (7,).
+        """
+        x, y, vx, vy = np.asarray(mallet, dtype=float).tolist()
+        angle, ahead = math.atan2(vy, vx), self.contact_distance
+        puck = np.array([[x + ahead * math.cos(angle), y + ahead * math.sin(angle)]])
+        index, inside = self._nearest(puck, np.array([angle]))
+        speeds = self.speed[:, index[0][0], index[1][0], index[2][0]]
+        if not inside[0] or not speeds.any():
+            return None
+        fast = speeds >= min(math.hypot(vx, vy), speeds.max())
+        leads = self._nearest_leads(np.asarray(joints, dtype=float), index)[:, 0]
+        layer = int(np.argmin(np.where(fast, leads, np.inf)))
+        return layer, int(index[0][0]), int(index[1][0]), int(index[2][0])
+
+    def _layers(self, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
+        """Speeds (L, B), interpolated."""
         where = np.column_stack([np.asarray(puck, dtype=float), np.asarray(angles, dtype=float)])
-        found = np.empty(len(where))
+        found = np.empty((len(self.speed), len(where)))
         low = np.array([grid[0] for grid in self.grids])
         step = np.array([grid[1] - grid[0] for grid in self.grids])
-        _interpolate(self.speed, low, step, np.ascontiguousarray(where), found)
+        for values, row in zip(self.speed, found, strict=True):
+            _interpolate(values, low, step, np.ascontiguousarray(where), row)
         return found
 
-    def cell(self, mallet: ArrayLike) -> tuple[int, int, int] | None:
-        """The entry nearest to a state (4,) of the mallet at the touch, table frame; None without strike."""
-        x, y, vx, vy = np.asarray(mallet, dtype=float).tolist()
-        angle = math.atan2(vy, vx)
-        ahead = self.contact_distance
-        puck = x + ahead * math.cos(angle), y + ahead * math.sin(angle)
-        index = []
-        for grid, value in zip(self.grids, (*puck, angle), strict=True):
-            step = grid[1] - grid[0]
-            if not grid[0] - 0.5 * step <= value <= grid[-1] + 0.5 * step:
-                return None
-            index.append(min(max(round((value - grid[0]) / step), 0), len(grid) - 1))
-        found = (index[0], index[1], index[2])
-        return found if self.speed[found] > 0.0 else None
+    def _nearest(self, puck: NDArray, angles: NDArray) -> tuple[tuple[NDArray, NDArray, NDArray], NDArray]:
+        """Nearest entries of pucks (B, 2) and angles (B,), and whether these are within half a step."""
+        index, inside = [], np.ones(len(angles), dtype=bool)
+        for grid, values in zip(self.grids, (puck[:, 0], puck[:, 1], angles), strict=True):
+            at = (values - grid[0]) / (grid[1] - grid[0])
+            inside &= (at >= -0.5) & (at <= len(grid) - 0.5)
+            index.append(np.clip(np.rint(at), 0, len(grid) - 1).astype(int))
+        return (index[0], index[1], index[2]), inside
+
+    def _nearest_leads(self, joints: NDArray, index: tuple[NDArray, NDArray, NDArray]) -> NDArray[np.float64]:
+        """Times (L, B) from joints (7,) at rest into entries."""
+        begin = self._starts[:, index[0], index[1], index[2]]
+        way = np.abs(begin - joints)
+        times = np.maximum(self.config.lead_factor * way * self._slowness, np.sqrt(way * self._inertness))
+        return times.max(axis=-1) + self.config.run_up
+
+    def _leads(self, joints: ArrayLike, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
+        """Times (L, B), inf where there is no strike."""
+        index, _ = self._nearest(np.asarray(puck, dtype=float), np.asarray(angles, dtype=float))
+        leads = self._nearest_leads(np.asarray(joints, dtype=float), index)
+        return np.where(self._layers(puck, angles) > 0.0, leads, np.inf)
+
+    @functools.cached_property
+    def _starts(self) -> NDArray[np.float64]:
+        """About where the run-ups begin at rest, joint positions (L, X, Y, A, 7) [rad]."""
+        return self.posture - 0.5 * self.config.run_up * self.rates
+
+    @functools.cached_property
+    def _slowness(self) -> NDArray[np.float64]:
+        return 1.0 / self.rules.limits(iiwa14()).velocity
+
+    @functools.cached_property
+    def _inertness(self) -> NDArray[np.float64]:
+        """Of a cubic from rest to rest: its square of time per way."""
+        return 6.0 / self.rules.limits(iiwa14()).acceleration
 
     def contact(
-        self, cell: tuple[int, int, int], place: ArrayLike, velocity: ArrayLike
+        self, cell: Cell, place: ArrayLike, velocity: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """The posture of an entry moved to where the universal joint is to be, with its velocity.
 
@@ -160,25 +233,9 @@ class StrikeTable:
         qd *= share
         return (q, qd) if _settle(q, qd, x, y, self.rules.height, vx, vy) else None
 
-    def start(self, cell: tuple[int, int, int]) -> NDArray[np.float64]:
+    def start(self, cell: Cell) -> NDArray[np.float64]:
         """About where the run-up of an entry begins at rest, joint positions (7,) [rad]."""
-        return self.posture[cell] - 0.5 * self.config.run_up * self.rates[cell]
-
-    def lead(self, joints: ArrayLike, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
-        """Least times (B,) [s] from joints (7,) at rest to the touch of pucks (B, 2) at angles (B,).
-
-        The joints go to the start of the run-up on a cubic, and from there into the strike; inf without one.
-        """
-        limits = self.rules.limits(iiwa14())
-        where = np.column_stack([np.asarray(puck, dtype=float), np.asarray(angles, dtype=float)])
-        low = np.array([grid[0] for grid in self.grids])
-        step = np.array([grid[1] - grid[0] for grid in self.grids])
-        index = np.clip(np.rint((where - low) / step).astype(int), 0, np.array(self.speed.shape) - 1)
-        entries = tuple(index.T)
-        begin = self.posture[entries] - 0.5 * self.config.run_up * self.rates[entries]
-        way = np.abs(begin - np.asarray(joints, dtype=float))
-        times = np.maximum(1.5 * way / limits.velocity, np.sqrt(6.0 * way / limits.acceleration))
-        return np.where(self.speeds(puck, angles) > 0.0, times.max(axis=1) + self.config.run_up, np.inf)
+        return self._starts[cell]
 
     def save(self, path: str | pathlib.Path, **origin: Any) -> None:
         """Write a file.
@@ -218,7 +275,8 @@ class StrikeTable:
         try:
             rules = {**about["rules"], "home": tuple(about["rules"]["home"])}
             distance = float(about["contact_distance"])
-            config = StrikeConfig(**about["config"])
+            settings = {**about["config"], "lead_weights": tuple(about["config"]["lead_weights"])}
+            config = StrikeConfig(**settings)
             return cls(**arrays, contact_distance=distance, config=config, rules=PlayRules(**rules))
         except (KeyError, TypeError, InvalidInputError, ConfigurationError) as error:
             raise ConfigurationError(f"{path} is not a table of strikes: {error}") from None
@@ -253,20 +311,22 @@ def tabulate(
     x, y, angle = (np.asarray(grid, dtype=float) for grid in (x, y, angle))
     if not (np.allclose(y, -y[::-1]) and np.allclose(angle, -angle[::-1])):
         raise InvalidInputError("strikes: the grids of y and angle must be symmetric about 0")
-    search = _Search(config, rules, contact_distance, effort, rng)
-    shape = (len(x), len(y), len(angle))
+    layers = [_Search(config, rules, weight, contact_distance, effort, rng) for weight in config.lead_weights]
+    shape = (len(layers), len(x), len(y), len(angle))
     speed, posture, rates = np.zeros(shape), np.zeros((*shape, 7)), np.zeros((*shape, 7))
-    half = [(i, j, k) for i in range(shape[0]) for j in range(len(y) // 2, shape[1]) for k in range(shape[2])]
+    score = np.full(shape, -np.inf)
+    half = itertools.product(range(len(x)), range(len(y) // 2, len(y)), range(len(angle)))
     # The second round starts from the neighbours' postures as well: better, and smoother over the table.
-    entries: Iterable[tuple[int, tuple[int, int, int]]] = [(n, index) for n in range(2) for index in half]
-    for again, (i, j, k) in progress(entries):
-        near = _neighbours(posture, speed, (i, j, k)) if again else np.zeros((0, 7))
-        found = search(np.array([x[i], y[j]]), angle[k], near)
-        if found[0] < speed[i, j, k]:
+    entries = list(itertools.product(range(2), range(len(layers)), list(half)))
+    for again, layer, (i, j, k) in progress(entries):
+        cell, twin = (layer, i, j, k), (layer, i, len(y) - 1 - j, len(angle) - 1 - k)
+        near = _neighbours(posture[layer], speed[layer], (i, j, k)) if again else np.zeros((0, 7))
+        found = layers[layer](np.array([x[i], y[j]]), angle[k], near)
+        if found[0] <= score[cell]:
             continue
-        twin = (i, len(y) - 1 - j, len(angle) - 1 - k)
-        speed[i, j, k], posture[i, j, k], rates[i, j, k] = found
-        speed[twin], posture[twin], rates[twin] = found[0], _MIRROR * found[1], _MIRROR * found[2]
+        score[cell] = score[twin] = found[0]
+        speed[cell], posture[cell], rates[cell] = found[1:]
+        speed[twin], posture[twin], rates[twin] = found[1], _MIRROR * found[2], _MIRROR * found[3]
     return StrikeTable(x, y, angle, speed, posture, rates, contact_distance, config, rules)
 
 
@@ -274,14 +334,15 @@ class _Search:
     """The search for one entry."""
 
     def __init__(
-        self, config: StrikeConfig, rules: PlayRules, distance: float, effort: int, rng: np.random.Generator
-    ) -> None:
+        self, config: StrikeConfig, rules: PlayRules, lead_weight: float, distance: float, effort: int,
+        rng: np.random.Generator,
+    ) -> None:  # fmt: skip
         limits, self._rules, self._distance = rules.limits(iiwa14()), rules, distance
         self._home = np.array(rules.home)
         self._velocity = config.speed_share * limits.velocity
         self._positions = 0.99 * limits.position_range[1]
         self._row = np.array(
-            [*rules.kernel_row(), config.run_up, config.hold, config.brake, config.lead_weight]
+            [*rules.kernel_row(), config.run_up, config.hold, config.brake, lead_weight]
         )
         # A strike as it is searched is nearer to the plane than what is allowed: replanning needs the rest.
         self._row[1] *= 0.4
@@ -290,16 +351,20 @@ class _Search:
         self._noise = rng.standard_normal((effort - effort // 5, 7))
         self._noise[:, 6] = 0.0  # it turns the rod about itself
 
-    def __call__(self, puck: NDArray, angle: float, near: NDArray) -> tuple[float, NDArray, NDArray]:
-        """Speed, posture and rates for a puck (2,), table frame; postures (S, 7) are tried first."""
+    def __call__(
+        self, puck: NDArray, angle: float, near: NDArray
+    ) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
+        """Score, speed, posture and rates for a puck (2,), table frame; postures (S, 7) are tried first."""
         direction = np.array([np.cos(angle), np.sin(angle)])
         place = puck + self._rules.table - self._distance * direction
         posture, rates = np.zeros(7), np.zeros(7)
-        speed, breaches = search_posture(
+        score, speed, breaches = search_posture(
             place[0], place[1], angle, self._velocity, self._positions, self._row, self._home,
             np.vstack([near, self._seeds]), self._noise, 8, posture, rates,
         )  # fmt: skip
-        return (speed if breaches < _LARGEST_BREACH and speed > _LEAST_SPEED else 0.0), posture, rates
+        if breaches > _LARGEST_BREACH or speed < _LEAST_SPEED:
+            return -np.inf, 0.0, posture, rates
+        return score, speed, posture, rates
 
 
 def _neighbours(posture: NDArray, speed: NDArray, index: tuple[int, int, int]) -> NDArray[np.float64]:

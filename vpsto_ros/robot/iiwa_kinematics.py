@@ -19,7 +19,7 @@ _LINKS = np.array([SHOULDER, UPPER_ARM, FOREARM, ROD])
 _BENDS = np.array([1.0, -1.0, 1.0])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def chain(q, points, axes):
     """Joints' axes and the points they pass through, of one posture.
 
@@ -52,7 +52,7 @@ def chain(q, points, axes):
     axes[6, 0], axes[6, 1], axes[6, 2] = zx, zy, zz
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def jacobian(points, axes, out):
     """Jacobian (3, 6) of the universal joint; joint 7 turns about the rod and moves nothing."""
     for j in range(6):
@@ -65,7 +65,7 @@ def jacobian(points, axes, out):
         out[2, j] = axes[j, 0] * ry - axes[j, 1] * rx
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_least_motion(jac, ex, ey, ez, q):
     """Add to q (7,) the least joint motion that moves the universal joint by (ex, ey, ez), to first order."""
     a, b, c, d, e, f = 1e-9, 0.0, 0.0, 1e-9, 0.0, 1e-9  # J J' and a trace of damping
@@ -86,7 +86,7 @@ def add_least_motion(jac, ex, ey, ez, q):
         q[j] += jac[0, j] * lx + jac[1, j] * ly + jac[2, j] * lz
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def move_to(q, x, y, z, points, axes, jac):
     """Move q (7,) to where the universal joint is at (x, y, z); whether that was reached.
 
@@ -104,7 +104,7 @@ def move_to(q, x, y, z, points, axes, jac):
     return abs(x - points[3, 0]) + abs(y - points[3, 1]) + abs(z - points[3, 2]) < 1e-7
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def move_to_height(q, z, points, axes, jac):
     """Move q (7,) by two Newton steps towards where the universal joint is at height z."""
     for _ in range(2):
@@ -118,7 +118,7 @@ def move_to_height(q, z, points, axes, jac):
             q[j] += gain * jac[2, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _rows(q, points):
     one, axes = np.empty((4, 3)), np.empty((7, 3))
     for b in range(q.shape[0]):
