@@ -108,7 +108,7 @@ class ShootingContacts:
         """Drop a shot that the arm has no motion for; what comes later is another one."""
         time, shot = self._node.seconds(message.header.stamp, CONTACT_AHEAD), self.planner.committed
         if shot is not None and abs(time - shot.time) < SAME_SHOT:
-            self.planner.forget()
+            self.planner.refuse()
             words = "the arm has no motion for the shot; another is sought"
             self._node.complaints.add("refused_contact", words)
 
