@@ -126,6 +126,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
+    "shooting_policy": Choice(
+        "sim_bridge.experiments.hockey.shooting_policy",
+        "the energy-based shooting policy and direct search",
+    ),
     "goal_probability": Choice(
         "sim_bridge.experiments.hockey.goal_probability",
         "whether shots score as often as the puck model says",
