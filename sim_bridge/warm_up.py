@@ -38,7 +38,7 @@ from vpsto_ros.planning.play_rules import PlayRules
 from vpsto_ros.planning.shooting import ShootingPlanner
 from vpsto_ros.planning.shot_preview import preview
 from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.strikes import StrikeTable, tabulate
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.robot.mallet_observer import MalletObserver
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch
@@ -53,7 +53,7 @@ def run(_arguments: argparse.Namespace | None = None) -> int:
     """
     began = time.perf_counter()
     pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
-    hockey = predict_a_puck, plan_a_shot
+    hockey = predict_a_puck, plan_a_shot, play_air_hockey
     for use in (*pushing, *hockey, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
@@ -136,6 +136,8 @@ def play_air_hockey() -> None:
     for step in range(3):
         observer.observe(0.01 * step, home + 0.001 * step, np.full(7, 0.1))
     AirHockeyWorld().advance(0.05)
+    grids = np.array([-0.6, -0.5]), np.array([-0.1, 0.1]), np.array([-0.1, 0.1])
+    tabulate(*grids, contact_distance=0.0798, rng=np.random.default_rng(0), effort=50)
 
 
 def evaluate_a_trajectory() -> None:
