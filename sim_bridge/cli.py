@@ -129,6 +129,7 @@ EXPERIMENTS = {
     "shooting_policy": Choice(
         "sim_bridge.experiments.hockey.shooting_policy",
         "the energy-based shooting policy and direct search",
+    ),
     "shooting": Choice(
         "sim_bridge.experiments.hockey.shooting",
         "the iiwa shoots pucks: score, speed, banks by setting",

@@ -293,12 +293,12 @@ def test_broken_contacts_are_refused_with_a_reason(striker, change, reason):
 
 
 def test_a_table_that_stands_elsewhere_has_no_strikes():
-    with pytest.raises(ConfigurationError, match="1.51"):
+    with pytest.raises(ConfigurationError, match=r"1.51"):
         strike_table(HockeyTableConfig(x=1.4))
 
 
 def test_the_kind_decides_whose_lead_counts():
     config = MpcPlannerConfig(kind="shooting", rate=50.0)
     assert config.lead == config.strike.lead and config.search[0] == "strike.approach.search"
-    with pytest.raises(ConfigurationError, match="strike.lead"):
+    with pytest.raises(ConfigurationError, match=r"strike.lead"):
         MpcPlannerConfig(kind="shooting", rate=50.0, deadline=0.0195)
