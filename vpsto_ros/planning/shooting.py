@@ -263,7 +263,9 @@ class ShootingPlanner:
         self.committed, self.reason, self._samples = shot, "", None
 
     def _worth(self, shot: Shot, tolerance: float = 0.0) -> float:
-        """The objective of a shot, less the price of its time; far less if it breaks a constraint."""
+        """The objective of a shot, less its price; far less if it breaks a constraint."""
         objective = self.config.objective
         good = shot.goal > objective.beta - tolerance and shot.banks >= objective.least_banks
-        return (shot.value if good else shot.goal - 10.0) - self.config.delay_price * shot.time
+        row = np.array([shot.angle]), np.array([shot.speed])
+        price = self.search.prices(np.array([shot.time]), shot.puck[None], *row)[0]
+        return float((shot.value if good else shot.goal - 10.0) - price)

@@ -99,9 +99,16 @@ class ShotSearch:
             int(outlook.banks[row]), float(self.config.objective.values(outlook)[row]), self._distance,
         )  # fmt: skip
 
-    def ranked(self, time: NDArray, outlook: ShotOutlook) -> NDArray[np.float64]:
-        """Scores (B,) less the price of touches at later times (B,)."""
-        return self.config.objective.scores(outlook) - self.config.delay_price * time
+    def prices(self, time: NDArray, puck: NDArray, angle: NDArray, speed: NDArray) -> NDArray[np.float64]:
+        """What shots (B,) cost besides their objective: they come late, or slower than they could (5.13)."""
+        largest = self.strikes.speeds(puck[:, :2], angle)
+        slack = 1.0 - speed / np.maximum(largest, speed)
+        return self.config.delay_price * time + self.config.slack_price * slack
+
+    def ranked(self, strokes: Strokes, outlook: ShotOutlook) -> NDArray[np.float64]:
+        """Scores (B,) less the prices of strokes."""
+        prices = self.prices(strokes.time, strokes.puck, strokes.angle, strokes.speed)
+        return self.config.objective.scores(outlook) - prices
 
     def taken(self, shot: Shot) -> bool:
         """Whether a shot may be chosen: it keeps the constraints, or is a fallback that reaches the goal."""
@@ -141,14 +148,15 @@ class ShotSearch:
             times[slot], pucks[slot], covariances[slot], self.angles[column], speeds[slot, column]
         )
         outlook = self.outlook(grid)
-        ranks = self.ranked(grid.time, outlook)
+        prices = self.prices(grid.time, grid.puck, grid.angle, grid.speed)
+        ranks = self.config.objective.scores(outlook) - prices
         promise = np.full(speeds.shape, -np.inf)
-        promise[slot, column] = self.config.objective.promise(outlook) - self.config.delay_price * grid.time
+        promise[slot, column] = self.config.objective.promise(outlook) - prices
         row = np.full(speeds.shape, -1)
         row[slot, column] = np.arange(len(slot))
         fine = self._refined(grid, row[_peaks(promise, self.config.peaks)])
         chances = self.outlook(fine)
-        finest = self.ranked(fine.time, chances)
+        finest = self.ranked(fine, chances)
         first, second = int(np.argmax(ranks)), int(np.argmax(finest)) if finest.size else -1
         if second >= 0 and finest[second] > ranks[first]:
             return self.shot(fine, chances, second)

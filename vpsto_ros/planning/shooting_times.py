@@ -119,7 +119,7 @@ class ContactTimes:
         largest = share * largest[possible]
         strokes = Strokes(times[slots], means[slots], covariances[slots], angles, largest)
         outlook = self.search.outlook(strokes)
-        return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes.time, outlook))))
+        return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes, outlook))))
 
     def places(
         self, means: NDArray, covariances: NDArray, *, chosen: bool = False
