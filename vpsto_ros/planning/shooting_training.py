@@ -43,7 +43,7 @@ class TrainingConfig:
     epochs: int = option(40, "passes over the states", minimum=1, maximum=10**5)
     batch: int = option(50, "states per step of Adam", minimum=1, maximum=10**5)
     negatives: int = option(
-        31, "counter-examples of a state that a pass draws of its M - 1", minimum=1, maximum=10**4
+        15, "counter-examples of a state that a pass draws of its M - 1", minimum=1, maximum=10**4
     )
     rate: float = option(2e-3, "learning rate at the beginning", minimum=1e-7, maximum=1.0)
     last_rate: float = option(2e-5, "and at the end; a cosine between", minimum=1e-8, maximum=1.0)
