@@ -170,7 +170,7 @@ class ShootingConfig:
         0.05, "objective that a later contact time must gain", unit="1/s", minimum=0.0, maximum=10.0
     )
     slack_price: float = option(
-        0.3, "objective that a shot must gain which is slower than (5.13) allows, for all of its speed",
+        1.0, "objective that a shot must gain which is slower than (5.13) allows, for all of its speed",
         minimum=0.0, maximum=10.0,
     )  # fmt: skip
     same_place: float = option(
