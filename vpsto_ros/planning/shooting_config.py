@@ -157,7 +157,7 @@ class ShootingConfig:
     time_step: float = option(0.05, "between contact times", unit="s", minimum=0.005, maximum=1.0)
     latest: float = option(2.5, "how far ahead the last contact time is", unit="s", minimum=0.1, maximum=10.0)
     times_per_step: int = option(
-        10, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
+        8, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
         maximum=1000,
     )  # fmt: skip
     policy_times_per_step: int = option(
