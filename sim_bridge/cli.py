@@ -128,6 +128,10 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.shooting",
         "the iiwa shoots pucks: score, speed, banks by setting",
     ),
+    "shooting_policy": Choice(
+        "sim_bridge.experiments.hockey.shooting_policy",
+        "the energy-based shooting policy and direct search",
+    ),
     "goal_probability": Choice(
         "sim_bridge.experiments.hockey.goal_probability",
         "whether shots score as often as the puck model says",

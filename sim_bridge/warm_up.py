@@ -28,25 +28,29 @@ from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.contact.pushing import PushingModel, push_directions
 from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
 from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
-from vpsto_ros.estimation.puck_filter import PuckFilter
+from vpsto_ros.estimation.puck_filter import PuckFilter, PuckState
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
+from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.shooting import ShootingPlanner
+from vpsto_ros.planning.strikes import StrikeTable
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch
 from vpsto_ros.trajectory.key_timing import time_key_positions
 
 
 def run(_arguments: argparse.Namespace | None = None) -> int:
-    """Push a box, track a can, predict a puck, evaluate trajectories, plan among obstacles.
+    """Push a box, track a can, predict and shoot a puck, evaluate trajectories, plan among obstacles.
 
     Returns:
         0.
     """
     began = time.perf_counter()
     pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
-    for use in (*pushing, predict_a_puck, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
+    hockey = predict_a_puck, plan_a_shot
+    for use in (*pushing, *hockey, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
     return 0
@@ -103,6 +107,14 @@ def predict_a_puck() -> None:
         tracker.observe_mallet(0.01 * step, np.array([-0.3, 0.0]), np.array([0.5, 0.0]))
         tracker.update(0.01 * step, np.array([-0.2 + 0.002 * step, 0.0]))
     tracker.state(0.5)
+
+
+def plan_a_shot() -> None:
+    """Contact planning at the air-hockey table."""
+    strikes, home = StrikeTable.load(), np.array(PlayRules().home)
+    planner = ShootingPlanner(PuckModel.load(SHIPPED), strikes)
+    puck = PuckState(0.0, np.array([-0.4, 0.1, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
+    planner.plan(0.0, puck, home)
 
 
 def evaluate_a_trajectory() -> None:

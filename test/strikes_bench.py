@@ -20,6 +20,10 @@ class StandInStrikes:
         slowest = self._slowest * (1.0 - 0.5 * (puck[:, 0] + 0.7))
         return np.where(inside, slowest * (1.0 + np.abs(angles / np.deg2rad(60.0)) ** 2.7), 0.0)
 
+    def timely_speeds(self, joints, puck, angles, available):
+        """All or nothing."""
+        return np.where(self.lead(joints, puck, angles) <= available, self.speeds(puck, angles), 0.0)
+
     def lead(self, joints, puck, angles):
         """Longer for lateral strikes and for places far from the middle."""
         return self._lead + 0.3 * np.abs(angles) + 0.2 * np.abs(puck[:, 1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_bridge import bench, cli
-from sim_bridge.bench import belief_rows, library_rows, system_rows
+from sim_bridge.bench import belief_rows, hockey_rows, library_rows, system_rows
 from sim_bridge.bench.comparison import compare
 from sim_bridge.bench.growth import exponent, growth_tables, in_words
 from sim_bridge.bench.measuring import (
@@ -212,6 +212,11 @@ def test_every_row_in_belief_space_works(row):
     assert first > 0.0
 
 
+@pytest.mark.parametrize("row", hockey_rows.ROWS, ids=lambda row: row.name)
+def test_every_row_of_air_hockey_works(row):
+    assert min(measure_once(row, 1, Effort(calls=3))) > 0.0
+
+
 def test_the_figures_wanted():
     wanted = {row.name: (row.wanted.entry, row.wanted.bound) for row in bench.ROWS if row.wanted is not None}
     assert wanted == {
@@ -226,6 +231,10 @@ def test_the_figures_wanted():
         "belief_iteration_14dof_b30_p20_k50": ("p50_ms", 1.0),
         "robust_circle_plan": ("p50_ms", 500.0),
         "robust_circle_plan_rich": ("p50_ms", 1500.0),
+        "shot_planning_step": ("p99_ms", 3.0),
+        "shot_planning_step_policy": ("p99_ms", 3.0),
+        "shot_search_contact_time": ("p50_ms", 1.0),
+        "shooting_policy_step": ("p50_ms", 1.0),
         "mpc_step_push_box": ("p99_ms", 16.0),
         "driver": ("real_time_factor", 20.0),
     }

@@ -10,14 +10,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from sim_bridge.bench import belief_rows, library_rows, system_rows
+from sim_bridge.bench import belief_rows, hockey_rows, library_rows, system_rows
 from sim_bridge.bench.comparison import compare, comparison_table, place, read_rows
 from sim_bridge.bench.growth import growth_tables
 from sim_bridge.bench.measuring import QUICK, Effort, Row, measure_once, statistics, usable_cores
 from sim_bridge.experiments.runs import print_verdict
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
-ROWS: tuple[Row, ...] = library_rows.ROWS + belief_rows.ROWS + system_rows.ROWS
+ROWS: tuple[Row, ...] = library_rows.ROWS + belief_rows.ROWS + hockey_rows.ROWS + system_rows.ROWS
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -10,20 +10,20 @@ import numpy as np
 from tqdm import tqdm
 
 from sim_bridge.cli import count, file
+from sim_bridge.experiments.hockey.shooting_comparison import compare
 from sim_bridge.experiments.runs import print_verdict
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig
 from vpsto_ros.planning.shooting_policy import EnergyModel, ShootingPolicy, save_policies
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
+from vpsto_ros.planning.shooting_search import ShotSearch
 from vpsto_ros.planning.shooting_training import TrainingConfig, examples, states, train
 from vpsto_ros.planning.strikes import SHIPPED as STRIKES
 from vpsto_ros.planning.strikes import StrikeTable
 
 ENOUGH = 0.9
 """Of the best objective, on states that training has not seen, below which a policy is not worth having."""
-INFERENCE_STEPS = 25
-"""Of Algorithm 2, from uniform samples."""
-_UNSEEN = 300
+_UNSEEN = 300  # pucks on which a policy is judged
+_STREAM = 4  # its pucks are not those of any experiment, whatever the seed
 _DEFAULT = TrainingConfig()
 
 
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     models, figures = {}, {}
     for number, (setting, objective) in enumerate(SETTINGS.items()):
         search = ShotSearch(model, strikes, ShootingConfig(objective=objective))
-        rng = np.random.default_rng((arguments.seed, number))
+        rng = np.random.default_rng((_STREAM, arguments.seed, number))
         models[setting], figures[setting] = learn(setting, search, config, rng)
         print(describe(setting, figures[setting]))
     path = pathlib.Path(arguments.out)
@@ -100,7 +100,8 @@ def learn(
             bar.set_postfix(loss=f"{loss:.3f}")
     duration = time.perf_counter() - began
     unseen = states(search, _UNSEEN, config.fastest, rng)
-    ratios, _ = objective_ratios(search, ShootingPolicy(model), unseen, config.covariance, rng)
+    policy = ShootingPolicy(model)
+    ratios = [compare(search, policy, state, config.covariance, rng).ratio for state in unseen]
     return model, {
         "epochs": config.epochs, "states": len(data.states), "actions": config.actions,
         "allowed": float(data.allowed.mean()), "first_loss": losses[0], "last_loss": losses[-1],
@@ -113,44 +114,6 @@ def input_range(search: ShotSearch, config: TrainingConfig) -> tuple[list[float]
     strikes, fastest = search.strikes, max(config.fastest, 1e-3)
     low = [strikes.x[0], strikes.y[0], -fastest, -fastest, strikes.angle[0]]
     return low, [strikes.x[-1], strikes.y[-1], fastest, fastest, strikes.angle[-1]]
-
-
-def objective_ratios(
-    search: ShotSearch, policy: ShootingPolicy, known: np.ndarray, covariance: np.ndarray,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """What a policy reaches of the objective of direct search.
-
-    Args:
-        search: of the setting.
-        policy: of the setting.
-        known: puck states at the touch, shape (B, 4).
-        covariance: of these, shape (4, 4).
-        rng: for the policy's samples.
-
-    Returns:
-        Ratios (B,): 0 where the policy's angle breaks a constraint, NaN where direct search finds no shot
-        that keeps them; and the angles (B,) [rad].
-    """
-    ratios, angles = np.full(len(known), np.nan), np.full(len(known), np.nan)
-    for row, state in enumerate(known):
-        best = search.best(0.0, state, covariance)
-        angles[row] = policy.angle(state, INFERENCE_STEPS, rng)
-        if best is None or not search.taken(best):
-            continue
-        ratios[row] = objective(search, state, covariance, angles[row]) / best.value
-    return ratios, angles
-
-
-def objective(search: ShotSearch, state: np.ndarray, covariance: np.ndarray, angle: float) -> float:
-    """(5.12) of an angle at the largest speed, 0 where that breaks a constraint or is not possible."""
-    angles = np.array([angle])
-    speeds = search.speeds(state[None, :2], angles)
-    if not speeds[0] > 0.0:
-        return 0.0
-    outlook = search.outlook(Strokes(np.zeros(1), state[None], covariance[None], angles, speeds))
-    wanted = search.config.objective
-    return float(wanted.values(outlook)[0]) if wanted.allowed(outlook)[0] else 0.0
 
 
 def describe(setting: str, figures: dict[str, Any]) -> str:

@@ -23,6 +23,10 @@ from vpsto_ros.planning.shooting_times import ContactTimes, Round
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
 
+SEARCHING = "contact times are being searched"
+"""Why there is no shot yet, before the first round is over."""
+STRUCK = "the puck has just been struck"
+"""Why there is no shot for a moment after a touch."""
 _ALIKE = (0.03, 0.15)  # times [s] and directions [rad] of shots that are much alike
 _REMEMBERED = 8  # shots that were refused
 _SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
@@ -66,21 +70,27 @@ class ShootingPlanner:
         self.search = ShotSearch(model, strikes, self.config)
         self._times = ContactTimes(self.search, policy, self._rng)
         self.committed: Shot | None = None
-        self._barred: list[Shot] = []
         self.forget()
 
     def forget(self) -> None:
-        """Drop the shot and begin to search anew."""
-        self.committed, self.reason = None, "contact times are being searched"
+        """Begin anew, as after a restart."""
+        self._drop(SEARCHING)
+        self._barred: list[Shot] = []
+        self._now = self._struck = -math.inf  # times of the last step and of the last touch [s]
+
+    def _drop(self, reason: str) -> None:
+        """Let go of the shot, and of what the search has found."""
+        self.committed, self.reason = None, reason
         self._before: Shot | None = None
         self._share = 1.0  # of the largest speed that the chosen shot has
         self._round: Round | None = None
         self._samples: PolicySamples | None = None
+        self._found_wrong = ""  # with what the last round has found
 
     def refuse(self) -> None:
         """The arm cannot do the chosen shot: back to the one before, if any, and never that again."""
         shot, before = self.committed, self._before
-        self.forget()
+        self._drop(SEARCHING)
         if shot is not None:
             self._barred = [*self._barred[-_REMEMBERED:], shot]
         if before is not None:
@@ -104,8 +114,14 @@ class ShootingPlanner:
         if objection or puck is None:
             self._drop(objection)
             return None
-        if self.committed is not None and now >= self.committed.time:
+        if now < self._now:  # a clock that was set back
             self.forget()
+        self._now = now
+        if self.committed is not None and now >= self.committed.time:
+            self._struck = self.committed.time
+            self._drop(STRUCK)
+        if now - self._struck < self.config.pause:
+            return None
         if self.committed is not None:
             objection = self._follow(self.committed, now, puck)
             if objection:
@@ -113,10 +129,6 @@ class ShootingPlanner:
         if self.committed is None or self.committed.time - now > self.config.frozen:
             self._look_around(now, puck, posture)
         return self.committed
-
-    def _drop(self, reason: str) -> None:
-        self.forget()
-        self.reason = reason
 
     def _objection(self, now: float, puck: PuckState | None, joints: NDArray) -> str:
         """What makes planning pointless, else empty."""
@@ -130,6 +142,8 @@ class ShootingPlanner:
             return "the puck's state has not the shapes (4,) and (4, 4)"
         if not (np.isfinite(puck.mean).all() and np.isfinite(puck.covariance).all()):
             return "the puck's state is not finite"
+        if (np.diag(puck.covariance) < 0.0).any():
+            return "the puck's state has a negative variance"
         if abs(now - puck.stamp) > self.config.oldest:
             return f"the puck's state is {now - puck.stamp:.2f} s old"
         if self._times.off_table(puck.mean[None])[0]:
@@ -169,13 +183,20 @@ class ShootingPlanner:
         """The shot, and what it would be if it were turned; empty if the arm can do none of this."""
         angles = shot.angle + self.config.angle_step * _TURNS
         if self._policy is not None:
-            angle, self._samples = self._policy.infer(mean[0], self._samples, self._rng)
-            angles = np.array([shot.angle, angle])
+            angles = np.array([shot.angle, self._proposal(self._policy, mean[0])])
         largest = self.search.speeds(np.repeat(mean[:, :2], len(angles), axis=0), angles)
         kept = largest > 0.0
         rows = np.zeros(kept.sum(), dtype=int)
         times = np.full(len(rows), shot.time)
         return Strokes(times, mean[rows], covariance[rows], angles[kept], self._share * largest[kept])
+
+    def _proposal(self, policy: ShootingPolicy, state: NDArray) -> float:
+        """The angle by the policy: a step of Algorithm 2 from the samples of the step before, (5.3.4)."""
+        if self._samples is None:
+            angle, self._samples = policy.solve(state, self.config.policy_steps, self._rng)
+        else:
+            angle, self._samples = policy.infer(state, self._samples, self._rng)
+        return angle
 
     def _preferred(self, angles: NDArray, outlook: ShotOutlook, angle: float) -> int | None:
         """Which of some angles to take: the one chosen before unless another gains; None if none is good."""
@@ -202,7 +223,7 @@ class ShootingPlanner:
                 self._commit(shot)
         if current.times.size:
             if self.committed is None:
-                self.reason = "contact times are being searched"
+                self.reason = self._found_wrong or SEARCHING
             return
         self._round = None
         if self.committed is None:
@@ -226,6 +247,7 @@ class ShootingPlanner:
             if not reason:
                 return
         self._drop(reason)
+        self._found_wrong = reason
 
     def _is_barred(self, shot: Shot) -> bool:
         """Whether it is much like one that the arm has refused."""
@@ -241,7 +263,9 @@ class ShootingPlanner:
         self.committed, self.reason, self._samples = shot, "", None
 
     def _worth(self, shot: Shot, tolerance: float = 0.0) -> float:
-        """The objective of a shot, less the price of its time; far less if it breaks a constraint."""
+        """The objective of a shot, less its price; far less if it breaks a constraint."""
         objective = self.config.objective
         good = shot.goal > objective.beta - tolerance and shot.banks >= objective.least_banks
-        return (shot.value if good else shot.goal - 10.0) - self.config.delay_price * shot.time
+        row = np.array([shot.angle]), np.array([shot.speed])
+        price = self.search.prices(np.array([shot.time]), shot.puck[None], *row)[0]
+        return float((shot.value if good else shot.goal - 10.0) - price)

@@ -11,6 +11,8 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.puck import ShotOutlook
 from vpsto_ros.exceptions import ConfigurationError
 
+_MISSING = 2.0  # price of a missing chance, in units of the objective
+
 
 class Strikes(Protocol):
     """What the arm can do: largest speeds (5.13) of the mallet along its motion, and the time they need."""
@@ -61,6 +63,15 @@ class ShootingObjective:
     def allowed(self, outlook: ShotOutlook) -> NDArray[np.bool_]:
         """Which shots (B,) keep the chance constraint and meet walls enough."""
         return (outlook.goal > self.beta) & (outlook.banks >= self.least_banks)
+
+    def promise(self, outlook: ShotOutlook) -> NDArray[np.float64]:
+        """Values (B,) less what is missing of the constraints: how much better an angle nearby may be.
+
+        Between two angles of a grid that both miss the threshold there may be one that exceeds it.
+        """
+        missing = np.maximum(self.beta - outlook.goal, 0.0)
+        few = outlook.banks < self.least_banks
+        return self.values(outlook) - _MISSING * (self.lambda1 + self.lambda2) * missing - 10.0 * few
 
     def scores(self, outlook: ShotOutlook) -> NDArray[np.float64]:
         """Values (B,) of allowed shots; the others rank below all of these, by their chance to score.
@@ -146,7 +157,7 @@ class ShootingConfig:
     time_step: float = option(0.05, "between contact times", unit="s", minimum=0.005, maximum=1.0)
     latest: float = option(2.5, "how far ahead the last contact time is", unit="s", minimum=0.1, maximum=10.0)
     times_per_step: int = option(
-        12, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
+        10, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
         maximum=1000,
     )  # fmt: skip
     policy_times_per_step: int = option(
@@ -158,6 +169,10 @@ class ShootingConfig:
     delay_price: float = option(
         0.05, "objective that a later contact time must gain", unit="1/s", minimum=0.0, maximum=10.0
     )
+    slack_price: float = option(
+        1.0, "objective that a shot must gain which is slower than (5.13) allows, for all of its speed",
+        minimum=0.0, maximum=10.0,
+    )  # fmt: skip
     same_place: float = option(
         0.01, "a puck that has moved less is searched for only once", unit="m", minimum=0.0, maximum=0.1
     )
@@ -186,6 +201,10 @@ class ShootingConfig:
     frozen: float = option(
         0.25, "time before the touch in which the shot only follows the puck", unit="s", minimum=0.0,
         maximum=2.0,
+    )  # fmt: skip
+    pause: float = option(
+        0.1, "time after a touch before another shot is planned: the mallet goes on through it", unit="s",
+        minimum=0.0, maximum=2.0,
     )  # fmt: skip
     largest_jump: float = option(
         0.05, "of the place of the touch from step to step, beyond which the shot is dropped", unit="m",

@@ -171,12 +171,14 @@ class ShootingPolicy:
         found = PolicySamples(angles, probabilities / probabilities.sum(), std)
         return float(angles[np.argmax(probabilities)]), found
 
-    def angle(self, state: ArrayLike, steps: int, rng: np.random.Generator) -> float:
-        """The angle after some steps from uniform samples [rad]."""
+    def solve(
+        self, state: ArrayLike, steps: int, rng: np.random.Generator
+    ) -> tuple[float, PolicySamples]:
+        """The angle after some steps from uniform samples [rad], and the samples."""
         angle, samples = self.infer(state, None, rng)
         for _ in range(steps - 1):
             angle, samples = self.infer(state, samples, rng)
-        return angle
+        return angle, samples
 
     @classmethod
     def load(cls, setting: str, path: str | pathlib.Path = SHIPPED) -> "ShootingPolicy":

@@ -99,9 +99,16 @@ class ShotSearch:
             int(outlook.banks[row]), float(self.config.objective.values(outlook)[row]), self._distance,
         )  # fmt: skip
 
-    def ranked(self, time: NDArray, outlook: ShotOutlook) -> NDArray[np.float64]:
-        """Scores (B,) less the price of touches at later times (B,)."""
-        return self.config.objective.scores(outlook) - self.config.delay_price * time
+    def prices(self, time: NDArray, puck: NDArray, angle: NDArray, speed: NDArray) -> NDArray[np.float64]:
+        """What shots (B,) cost besides their objective: they come late, or slower than they could (5.13)."""
+        largest = self.strikes.speeds(puck[:, :2], angle)
+        slack = 1.0 - speed / np.maximum(largest, speed)
+        return self.config.delay_price * time + self.config.slack_price * slack
+
+    def ranked(self, strokes: Strokes, outlook: ShotOutlook) -> NDArray[np.float64]:
+        """Scores (B,) less the prices of strokes."""
+        prices = self.prices(strokes.time, strokes.puck, strokes.angle, strokes.speed)
+        return self.config.objective.scores(outlook) - prices
 
     def taken(self, shot: Shot) -> bool:
         """Whether a shot may be chosen: it keeps the constraints, or is a fallback that reaches the goal."""
@@ -141,15 +148,17 @@ class ShotSearch:
             times[slot], pucks[slot], covariances[slot], self.angles[column], speeds[slot, column]
         )
         outlook = self.outlook(grid)
-        ranks = np.full(speeds.shape, -np.inf)
-        ranks[slot, column] = self.ranked(grid.time, outlook)
+        prices = self.prices(grid.time, grid.puck, grid.angle, grid.speed)
+        ranks = self.config.objective.scores(outlook) - prices
+        promise = np.full(speeds.shape, -np.inf)
+        promise[slot, column] = self.config.objective.promise(outlook) - prices
         row = np.full(speeds.shape, -1)
         row[slot, column] = np.arange(len(slot))
-        fine = self._refined(grid, row[_peaks(ranks, self.config.peaks)])
+        fine = self._refined(grid, row[_peaks(promise, self.config.peaks)])
         chances = self.outlook(fine)
-        finest = self.ranked(fine.time, chances)
-        first, second = int(np.argmax(ranks[slot, column])), int(np.argmax(finest)) if finest.size else -1
-        if second >= 0 and finest[second] > ranks[slot, column][first]:
+        finest = self.ranked(fine, chances)
+        first, second = int(np.argmax(ranks)), int(np.argmax(finest)) if finest.size else -1
+        if second >= 0 and finest[second] > ranks[first]:
             return self.shot(fine, chances, second)
         return self.shot(grid, outlook, first)
 
@@ -168,10 +177,10 @@ class ShotSearch:
         return grid.with_angles(rows[there], angle[there], speed[there])
 
 
-def _peaks(ranks: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Where (K, A) ranks are highest among their neighbours in a row: the best few."""
-    padded = np.pad(ranks, ((0, 0), (1, 1)), constant_values=-np.inf)
-    peak = np.isfinite(ranks) & (ranks >= padded[:, :-2]) & (ranks > padded[:, 2:])
+def _peaks(values: NDArray, count: int) -> tuple[NDArray, NDArray]:
+    """Where (K, A) values are higher than their neighbours in a row: the best few."""
+    padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peak = np.isfinite(values) & (values >= padded[:, :-2]) & (values > padded[:, 2:])
     slot, column = np.nonzero(peak)
-    chosen = np.argsort(-ranks[slot, column], kind="stable")[:count]
+    chosen = np.argsort(-values[slot, column], kind="stable")[:count]
     return slot[chosen], column[chosen]

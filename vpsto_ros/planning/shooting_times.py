@@ -18,6 +18,7 @@ NO_OBJECTION: Objection = (-1, "")
 _SOONEST = 0.05  # no touch is planned so soon [s]
 _SURE = 2.0  # standard deviations of its place by which a puck must be within reach
 _BEYOND = 0.01  # how far beyond the reach a chosen shot may get [m]
+_FASTER = 1.02  # what makes it worth while to search a direction again
 _RIM = 0.02  # estimates of a puck at a rim may be so far in it [m]
 _AT_REST = 0.03  # slower pucks do not move away [m/s]
 
@@ -30,14 +31,14 @@ class Round:
         times: that are left to search, shape (K,) [s].
         shots: the best of each step so far.
         place: of the puck where the grid was searched last, shape (2,) [m].
-        covered: directions that have been searched there, shape (A,).
+        covered: largest speed that has been searched there in each direction, shape (A,) [m/s].
         objection: how far the best candidates have come, and what was wrong with them.
     """
 
     times: NDArray
     shots: list[Shot] = dataclasses.field(default_factory=list)
     place: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.full(2, np.inf))
-    covered: NDArray[np.bool_] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=bool))
+    covered: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.zeros(0))
     objection: Objection = NO_OBJECTION
 
 
@@ -87,13 +88,12 @@ class ContactTimes:
         chunk, rest = slots[:count], slots[count:]
         times, shot, found = current.times[chunk], None, NO_OBJECTION
         if chunk.size:
-            speeds, there, objection = self._speeds(means[chunk], times - now, joints)
-            searched = self._fresh(current, means[chunk, :2], speeds > 0.0)
-            if rest.size and self._all_seen(current, means[rest, :2], there[-1]):
+            speeds, largest, objection = self._speeds(means[chunk], times - now, joints)
+            speeds = self._fresh(current, means[chunk, :2], speeds)
+            if rest.size and self._all_seen(current, means[rest, :2], largest[-1]):
                 rest = rest[:0]
-            if searched.any():
+            if speeds.any():
                 find = self._inferred if self.policy is not None else self.search.best_of
-                speeds = np.where(searched, speeds, 0.0)
                 shot = find(times, means[chunk], covariances[chunk], speeds)
                 found = self._complaint(shot)
         current.objection = max(current.objection, objection, found)
@@ -107,7 +107,7 @@ class ContactTimes:
         assert self.policy is not None
         steps = self.search.config.policy_steps
         slots = np.flatnonzero(speeds.any(axis=1))
-        angles = np.array([self.policy.angle(means[slot], steps, self._rng) for slot in slots])
+        angles = np.array([self.policy.solve(means[slot], steps, self._rng)[0] for slot in slots])
         near = np.argmin(np.abs(self.search.angles - angles[:, None]), axis=1)
         largest = self.search.speeds(means[slots, :2], angles)
         possible = (largest > 0.0) & (speeds[slots, near] > 0.0)
@@ -119,7 +119,7 @@ class ContactTimes:
         largest = share * largest[possible]
         strokes = Strokes(times[slots], means[slots], covariances[slots], angles, largest)
         outlook = self.search.outlook(strokes)
-        return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes.time, outlook))))
+        return self.search.shot(strokes, outlook, int(np.argmax(self.search.ranked(strokes, outlook))))
 
     def places(
         self, means: NDArray, covariances: NDArray, *, chosen: bool = False
@@ -149,7 +149,7 @@ class ContactTimes:
         """Speeds (K, A) of the mallet for the grid; 0 for what is not possible in the time (K,) [s].
 
         Returns:
-            The speeds; which directions there would be with more time; the objection if there is none.
+            The speeds; those (K, A) that there would be with more time; the objection if there is none.
         """
         shape = (len(means), len(self.search.angles))
         puck = np.repeat(means[:, :2], shape[1], axis=0)
@@ -173,23 +173,23 @@ class ContactTimes:
             timely[rows] = self.search.strikes.timely_speeds(joints, puck[rows], angles[rows], spare)
             if not timely.any():
                 objection = (9, "the arm cannot be there in time")
-        return timely.reshape(shape), there.reshape(shape), objection
+        return timely.reshape(shape), np.where(there, speeds, 0.0).reshape(shape), objection
 
-    def _fresh(self, current: Round, places: NDArray, possible: NDArray) -> NDArray[np.bool_]:
-        """Which of the possible directions (K, A) have not been searched at nearly the same place (K, 2)."""
-        fresh = possible.copy()
+    def _fresh(self, current: Round, places: NDArray, speeds: NDArray) -> NDArray[np.float64]:
+        """Speeds (K, A) of which none as fast has been searched at nearly the same place (K, 2), else 0."""
+        fresh = speeds.copy()
         for k, place in enumerate(places):
             if math.dist(place, current.place) < self.search.config.same_place:
-                fresh[k] &= ~current.covered
-                current.covered = current.covered | possible[k]
+                fresh[k, speeds[k] <= _FASTER * current.covered] = 0.0
+                current.covered = np.maximum(current.covered, speeds[k])
             else:
-                current.place, current.covered = place, possible[k]
+                current.place, current.covered = place, speeds[k]
         return fresh
 
-    def _all_seen(self, current: Round, places: NDArray, there: NDArray) -> bool:
-        """Whether the puck stays where all possible directions (A,) have been searched."""
+    def _all_seen(self, current: Round, places: NDArray, largest: NDArray) -> bool:
+        """Whether the puck stays where all that there is to search, up to speeds (A,), has been searched."""
         apart = np.linalg.norm(places - current.place, axis=1).max()
-        return bool(apart < self.search.config.same_place and (current.covered | ~there).all())
+        return bool(apart < self.search.config.same_place and (_FASTER * current.covered >= largest).all())
 
     def _complaint(self, shot: Shot | None) -> Objection:
         """What is wrong with the best shot that was found."""

@@ -340,11 +340,11 @@ class StrikeMpc(ReferencePlanner):
 
     def _begin(self, takeover: float, contact: MalletContact, fresh: bool) -> ArmState:
         """Where planning begins: at the takeover, or later while there is time to wait."""
-        start = takeover
-        if fresh and self.contact is None:
-            start = max(takeover, contact.time - self.config.longest)
-        elif self._approach.previous is not None:
-            start = max(takeover, self._approach.previous.start_time)
+        # Until the motion into a touch begins the arm waits, or is on its way home.
+        before, start = self._approach.previous, contact.time - self.config.longest
+        if self.contact is not None and before is not None:
+            start = before.start_time if not fresh else min(start, before.start_time)
+        start = max(takeover, start)
         position, velocity, _ = extended(self._running, start).state(start)
         return ArmState(start, position, velocity)
 
