@@ -18,6 +18,7 @@ examples:
   vpsto demo push_box --viewer                the same with a live 3-D view in the browser
   vpsto demo push_box --real-time-factor 0.5  on a slow machine: simulated time runs at half speed
   vpsto demo bimanual_push                    two arms push a can by a belief; see output/bimanual_push
+  vpsto demo air_hockey                       an arm with a mallet shoots pucks; see output/air_hockey
   vpsto experiment push_box --runs 20         20 random boxes, in lock-step and without ROS
   vpsto experiment push_box --resume          go on with an experiment that was stopped
   vpsto learn puck_model                      how a puck bounces and is hit; see output/puck_model.json
@@ -41,6 +42,7 @@ DEMOS = {
         "sim_bridge.demo.bimanual_push",
         "two simulated FR3 push a can by a belief over where it is; a hand moves it away",
     ),
+    "air_hockey": Choice("sim_bridge.demo.air_hockey", "a simulated iiwa shoots ten pucks at a goal"),
 }
 EXPERIMENTS = {
     "push_box": Choice(
@@ -124,13 +126,13 @@ EXPERIMENTS = {
         "sim_bridge.experiments.hockey.puck_model",
         "how well the learned puck model knows where pucks go",
     ),
-    "shooting": Choice(
-        "sim_bridge.experiments.hockey.shooting",
-        "the iiwa shoots pucks: score, speed, banks by setting",
-    ),
     "shooting_policy": Choice(
         "sim_bridge.experiments.hockey.shooting_policy",
         "the energy-based shooting policy and direct search",
+    ),
+    "shooting": Choice(
+        "sim_bridge.experiments.hockey.shooting",
+        "the iiwa shoots pucks: score, speed, banks by setting",
     ),
     "goal_probability": Choice(
         "sim_bridge.experiments.hockey.goal_probability",

@@ -16,6 +16,7 @@ from sim_bridge.experiments.clutter.mpc_runs import Task, run_task
 from sim_bridge.experiments.clutter.mppi import MppiConfig
 from sim_bridge.experiments.clutter.world import CLUTTER, GOAL, LIMITS, STARTS
 from sim_bridge.experiments.pushing.loop import push_box_loop
+from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.scene import Scene
 from sim_bridge.simulation import Simulation
 from vpsto_ros.belief.dynamics import BeliefDynamics
@@ -35,8 +36,11 @@ from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 from vpsto_ros.planning.play_rules import PlayRules
 from vpsto_ros.planning.shooting import ShootingPlanner
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.shot_preview import preview
+from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.strikes import StrikeTable, tabulate
 from vpsto_ros.robot.kinematics import fr3_pusher
+from vpsto_ros.robot.mallet_observer import MalletObserver
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch
 from vpsto_ros.trajectory.key_timing import time_key_positions
 
@@ -49,7 +53,7 @@ def run(_arguments: argparse.Namespace | None = None) -> int:
     """
     began = time.perf_counter()
     pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
-    hockey = predict_a_puck, plan_a_shot
+    hockey = predict_a_puck, plan_a_shot, play_air_hockey
     for use in (*pushing, *hockey, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
@@ -115,6 +119,25 @@ def plan_a_shot() -> None:
     planner = ShootingPlanner(PuckModel.load(SHIPPED), strikes)
     puck = PuckState(0.0, np.array([-0.4, 0.1, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
     planner.plan(0.0, puck, home)
+
+
+def play_air_hockey() -> None:
+    """A shot that is chosen and looked at, a strike in the simulated world, rules and mallet watched."""
+    model, strikes = PuckModel.load(SHIPPED), StrikeTable.load()
+    planner, mpc, home = ShootingPlanner(model, strikes), StrikeMpc(strikes), np.array(strikes.rules.home)
+    for step in range(30):
+        puck = PuckState(0.02 * step, np.array([-0.5, 0.0, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
+        shot = planner.plan(0.02 * step, puck, home)
+    preview(model, planner.config, puck, shot)
+    contact = MalletContact(2.0, np.array([-0.58, 0.0, 0.9, 0.0]))
+    for step in range(4):
+        mpc.accept(mpc.step(0.02 * step, home, np.zeros(7), contact if step else None))
+    observer = MalletObserver()
+    for step in range(3):
+        observer.observe(0.01 * step, home + 0.001 * step, np.full(7, 0.1))
+    AirHockeyWorld().advance(0.05)
+    grids = np.array([-0.6, -0.5]), np.array([-0.1, 0.1]), np.array([-0.1, 0.1])
+    tabulate(*grids, contact_distance=0.0798, rng=np.random.default_rng(0), effort=50)
 
 
 def evaluate_a_trajectory() -> None:

@@ -14,18 +14,19 @@ TABLE, PERIOD = HockeyTable(), 0.02
 REACH = TABLE.reach
 
 
-def model(share=0.13, growth=0.9, delay=5e-3):
+def model(share=0.13, growth=0.6, slip=0.3, delay=5e-3):
     """One whose matrices are full, so that every entry counts."""
+    shares = np.array([[growth, slip], [0.7 * growth, 0.5 * slip]])
     floating = LinearGaussian([[0.99, 2e-3], [-1e-3, 0.985]], [1e-4, -2e-4], [[4e-6, 1e-6], [1e-6, 9e-6]])
     wall = LinearGaussian(
-        [[-0.73, 0.02], [0.03, 0.85]], [4e-3, -2e-3], [[9e-4, 1e-4], [1e-4, 4e-4]], growth, APPROACH["wall"]
+        [[-0.73, 0.02], [0.03, 0.85]], [4e-3, -2e-3], [[9e-4, 1e-4], [1e-4, 4e-4]], shares, APPROACH["wall"]
     )
     mallet = LinearGaussian(
         [[-0.4, 0.01, 1.4, 0.02], [-0.01, 0.77, 0.03, 0.21]], [0.01, 2e-3], [[1e-3, 1e-4], [1e-4, 3e-4]],
-        growth, APPROACH["mallet"],
+        shares, APPROACH["mallet"],
     )  # fmt: skip
     lively = LinearGaussian(
-        [[-0.92, 0.01], [0.02, 0.88]], [2e-3, 1e-3], [[4e-3, 2e-4], [2e-4, 6e-4]], growth, APPROACH["wall"]
+        [[-0.92, 0.01], [0.02, 0.88]], [2e-3, 1e-3], [[4e-3, 2e-4], [2e-4, 6e-4]], shares, APPROACH["wall"]
     )
     mixed = {"lively": lively, "lively_share": share} if share else {}
     return PuckModel(TABLE, PERIOD, floating, wall, mallet, delay, **mixed)
@@ -34,18 +35,19 @@ def model(share=0.13, growth=0.9, delay=5e-3):
 # The twins.
 
 
-def scaled(mode, inputs, variance):
-    growth = mode.growth
-    return (1.0 - growth + growth * ((mode.approach @ inputs) ** 2 + variance)) * mode.covariance
+def scaled(mode, inputs, variances):
+    squares = (mode.approach @ inputs) ** 2 + variances
+    root = np.diag(np.sqrt(1.0 - mode.growth.sum(axis=1) + mode.growth @ squares))
+    return root @ mode.covariance @ root
 
 
-def bounced(puck, kind, before, variance):
+def bounced(puck, kind, before, variances):
     """Matrix, velocity and covariance of a bounce in its frame."""
     modes = {"usual": [(1.0, puck.wall)], "lively": [(1.0, puck.lively)]}.get(kind)
     modes = modes or [(1.0 - puck.lively_share, puck.wall), (puck.lively_share, puck.lively or puck.wall)]
     mean = sum(w * m.mean(before) for w, m in modes)
     spread = sum(
-        w * (scaled(m, before, variance) + np.outer(m.mean(before) - mean, m.mean(before) - mean))
+        w * (scaled(m, before, variances) + np.outer(m.mean(before) - mean, m.mean(before) - mean))
         for w, m in modes
     )
     return sum(w * m.matrix for w, m in modes), mean, spread
@@ -79,7 +81,8 @@ def step(puck, mean, covariance, kind="merged", part=1.0):
         frame = np.zeros((2, 2))
         frame[axis, 0] = -side
         frame[:, 1] = [-frame[1, 0], frame[0, 0]]
-        theta, after, scatter = bounced(puck, kind, frame.T @ v, covariance[2 + axis, 2 + axis])
+        variances = np.diag(covariance)[[2 + axis, 3 - axis]]
+        theta, after, scatter = bounced(puck, kind, frame.T @ v, variances)
         theta, after, scatter = frame @ theta @ frame.T, frame @ after, frame @ scatter @ frame.T
         rest = duration - time
         position = x + time * v + rest * after
@@ -214,7 +217,7 @@ def hit_from(puck, state, mallet):
 
 def test_what_is_not_known_of_a_puck_turns_the_hit():
     """Against hits of pucks that are a bit off, each met at its own time: the Jacobian column by column."""
-    puck, rng, step_ = model(0.0, 0.0), np.random.default_rng(3), 1e-6
+    puck, rng, step_ = model(0.0, 0.0, 0.0), np.random.default_rng(3), 1e-6
     state, mallets = strike(rng, 20)
     for mallet in mallets:
         columns = []
@@ -287,7 +290,7 @@ def test_posts_let_in_whoever_their_bounce_does_not_turn_back():
 
 
 def test_scatter_grows_with_the_speed_of_approach():
-    puck, calm = model(0.0, growth=0.9), model(0.0, growth=0.0)
+    puck, calm = model(0.0, 0.9, 0.0), model(0.0, 0.0, 0.0)
     for speed in (0.5, 1.0, 2.0):
         start = np.array([REACH[0] - 0.005, 0.3, speed, 0.0])
         grown, constant = (m.step(start, np.zeros((4, 4)))[1][2, 2] for m in (puck, calm))
@@ -298,7 +301,7 @@ def test_scatter_grows_with_the_speed_of_approach():
 
 
 def test_samples_bounce_lively_as_often_as_they_should():
-    puck = model(0.3, growth=0.99)
+    puck = model(0.3, 0.9, 0.05)
     paths = puck.simulate(np.tile([REACH[0] - 0.01, 0.3, 1.0, 0.2], (20_000, 1)), 1, np.random.default_rng(6))
     mean, covariance = puck.step([REACH[0] - 0.01, 0.3, 1.0, 0.2], np.zeros((4, 4)))
     np.testing.assert_allclose(paths[:, 1].mean(axis=0), mean, atol=3e-3)
@@ -315,5 +318,5 @@ def test_shots_refuse_what_does_not_fit():
         puck.shots(np.zeros(4), spread, np.zeros((2, 4)))
     with pytest.raises(InvalidInputError, match="share of lively"):
         dataclasses.replace(puck, lively_share=0.0)
-    with pytest.raises(InvalidInputError, match="speed of approach"):
-        dataclasses.replace(puck, wall=dataclasses.replace(puck.wall, approach=[0.0, 1.0]))
+    with pytest.raises(InvalidInputError, match="speeds of approach"):
+        dataclasses.replace(puck, wall=dataclasses.replace(puck.wall, approach=[[0.0, 1.0], [1.0, 0.0]]))

@@ -19,10 +19,11 @@ from rclpy.serialization import serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sim_bridge.demo.bimanual_push import DEMO as BIMANUAL_PUSH
-from sim_bridge.demo.observer import GOAL_REPEAT, NodeThread, Observer, moves
+from sim_bridge.demo.observer import NodeThread, Observer, moves
 from sim_bridge.demo.processes import ProcessGroup
 from sim_bridge.demo.push_box import DEMO as PUSH_BOX
 from sim_bridge.demo.push_box import box_scenario
+from sim_bridge.demo.pushing import GOAL_REPEAT, PushingScript
 from sim_bridge.demo.running import _trouble, _watch
 from sim_bridge.demo.scenario import Orders
 from sim_bridge.demo.verdict import Outcome, give_up, verdict
@@ -46,7 +47,7 @@ class Sent(list):
 @pytest.fixture
 def observer():
     rclpy.init()
-    node = Observer(NoBag(), box_scenario(np.random.default_rng(0)), Scene().plane())
+    node = Observer(NoBag(), PushingScript(box_scenario(np.random.default_rng(0)), Scene().plane()))
     yield node
     node.destroy_node()
     rclpy.try_shutdown()
@@ -58,13 +59,14 @@ def plan(*positions):
 
 def test_a_goal_that_stands_is_repeated(observer, monkeypatch):
     sent = Sent()
-    monkeypatch.setattr(observer, "_goals", sent)
+    script = observer._script
+    monkeypatch.setattr(script, "_goals", sent)
     goal = np.array([0.5, 0.1])
     for now in np.arange(0.0, 5.0, 0.02):
-        observer._carry_out(Orders(goal), now)
+        script.carry_out(Orders(goal), now)
     assert 5 <= len(sent) <= 5.0 / GOAL_REPEAT + 1
     assert {(m.pose.position.x, m.pose.position.y) for m in sent} == {(0.5, 0.1)}
-    observer._carry_out(Orders(np.array([0.6, 0.0])), 5.0)
+    script.carry_out(Orders(np.array([0.6, 0.0])), 5.0)
     assert sent[-1].pose.position.x == 0.6, "a jump does not wait"
 
 
@@ -72,7 +74,7 @@ def test_a_plan_at_rest_is_no_first_plan(observer):
     receive = observer._receiver("/joint_trajectory")
     receive(serialize_message(plan(0.1, 0.2)))
     assert observer.first_plan is None, "there was no target yet"
-    observer._goal = np.array([0.5, 0.1])
+    observer._script.goal = np.array([0.5, 0.1])
     for resting in (plan(), plan(0.1), plan(0.1, 0.1, 0.1)):
         receive(serialize_message(resting))
     assert observer.first_plan is None
@@ -109,7 +111,7 @@ def test_a_failing_callback_ends_the_watch_with_its_error(observer, tmp_path):
     observer.create_timer(0.01, fail)
     began = time.monotonic()
     with NodeThread(observer) as spinning, ProcessGroup(tmp_path, {}) as processes:
-        arguments = (box_scenario(np.random.default_rng(0)), lambda _: None, time.monotonic() + 60.0)
+        arguments = (observer._script, lambda _: None, time.monotonic() + 60.0)
         with pytest.raises(VpstoError, match=r"own node failed: OSError: no space left") as caught:
             _watch(observer, spinning, processes, *arguments)
     assert isinstance(caught.value.__cause__, OSError)
@@ -117,7 +119,7 @@ def test_a_failing_callback_ends_the_watch_with_its_error(observer, tmp_path):
 
 
 def test_a_node_that_dies_before_the_first_step_gives_a_verdict(tmp_path, capsys):
-    outcome = Outcome(box_scenario(np.random.default_rng(0)))
+    outcome = Outcome(PushingScript(box_scenario(np.random.default_rng(0)), Scene().plane()))
     with ProcessGroup(tmp_path / "logs", {}) as processes:
         processes.start("mpc_planner", [sys.executable, "-c", "print('no licence'); raise SystemExit(3)"])
         while not processes.ended():

@@ -9,7 +9,7 @@ from sim_bridge.demo.push_box import box_scenario
 from sim_bridge.report import recording as rec
 from sim_bridge.report.bag import BagRecorder, read_messages, typestore
 from sim_bridge.report.overlay import LINE_LIST, LINE_STRIP, SPHERE_LIST, overlays_of
-from sim_bridge.report.page import demo_tables
+from sim_bridge.report.page import push_tables
 from sim_bridge.report.recording import Command, JointSeries, PoseSeries, Recording, Status
 from sim_bridge.report.summary import (
     RunFacts,
@@ -274,7 +274,7 @@ def test_a_scenario_without_a_drift_is_not_judged_by_one():
     story.phases = [phase for phase in story.phases if phase.judged]
     summary = summarize(good_run(), story, TOOLS, FACTS)
     assert summary["success"] and "drift" not in summary
-    assert all("drift" not in row[0] for _, rows in demo_tables(summary) for row in rows)
+    assert all("drift" not in row[0] for _, rows in push_tables(summary) for row in rows)
 
 
 def marker(name, kind, *points, action=0):
@@ -398,10 +398,10 @@ def test_a_planner_that_falls_silent_is_not_taken_to_have_gone_on():
     assert math.isnan(rate_of(counters(12.0, 0, 0, 0))["deadline_miss_fraction"])
 
 
-def test_the_length_of_a_recording_is_that_with_a_target():
-    assert good_run().duration() == pytest.approx(10.0)
+def test_the_length_of_a_recording_is_that_since_the_start():
+    assert good_run().duration(0.0) == pytest.approx(10.0)
+    assert good_run().duration(4.0) == pytest.approx(6.0) and good_run().duration(math.nan) == 0.0
     empty = PoseSeries(np.empty(0), np.empty((0, 3)))
-    assert dataclasses.replace(good_run(), goal=empty).duration() == 0.0
-    assert dataclasses.replace(good_run(), object=empty).duration() == 0.0
+    assert dataclasses.replace(good_run(), object=empty).duration(0.0) == 0.0
     none = JointSeries(np.empty(0), *[np.empty((0, 7))] * 3)
-    assert dataclasses.replace(good_run(), joints=none).duration() == 0.0
+    assert dataclasses.replace(good_run(), joints=none).duration(0.0) == 0.0

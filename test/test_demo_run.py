@@ -93,14 +93,41 @@ def test_the_report_shows_what_the_nodes_drew(short_run):
     assert names and names <= expected == drawn
 
 
+@pytest.fixture(scope="module")
+def short_game(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo") / "air_hockey"
+    demo = start(out, "--duration", "15", "--seed", "1004", demo="air_hockey")
+    return out, demo.communicate(timeout=300)[0], demo.returncode
+
+
+def test_a_game_leaves_what_it_promises_and_keeps_the_rules(short_game):
+    out, text, status = short_game
+    promised = {"summary.json", "report.html", "bag", "logs", "shots.png", "table.png", "joints.png"}
+    assert {entry.name for entry in out.iterdir()} >= promised, text
+    summary = json.loads((out / "summary.json").read_text())
+    assert status == (0 if summary["success"] else 1)
+    assert summary["pucks"] == 10 and len(summary["shots"]) >= 1
+    assert summary["limit_violations"] == 0 and summary["rule_violations"]["side"] == 0
+    assert "exited with status" not in text and "ended during the run" not in text
+    assert nodes_of(out) == []
+
+
+def test_a_game_shows_what_was_expected_of_the_pucks(short_game):
+    recording = Recording.from_bag(short_game[0] / "bag")
+    drawings = [drawing for drawings in recording.drawn.values() for drawing in drawings]
+    overlays = [overlay for drawing in drawings for overlay in drawing.overlays]
+    assert {"puck_path", "shot_path", "shot_spread", "touch", "shot"} <= {o.name for o in overlays}
+    assert any("to score" in overlay.text for overlay in overlays)
+
+
 KILLING = """
 import sys, time
 from sim_bridge import cli
 from sim_bridge.demo import running
 delay, ready = float(sys.argv.pop(1)), running._wait_until_active
 
-def wait(observer, spinning, processes):
-    ready(observer, spinning, processes)
+def wait(observer, spinning, processes, script):
+    ready(observer, spinning, processes, script)
     if not delay:
         processes._processes["franka_driver"].kill()
         processes._processes["franka_driver"].wait()
@@ -109,7 +136,7 @@ def wait(observer, spinning, processes):
 
 def act(observer, original=running.Observer._act):
     original(observer)
-    if delay and observer._scenario.phase.start + delay < observer.simulated_time:
+    if delay and observer._script.scenario.phase.start + delay < observer.simulated_time:
         raise OSError("the disk is full")
 
 running._wait_until_active, running.Observer._act = wait, act

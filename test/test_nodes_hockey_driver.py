@@ -208,3 +208,19 @@ def test_worlds_are_chosen_by_a_parameter():
         FrankaDriverConfig(world="tennis")
     assert type(FrankaDriverConfig().simulation()).__name__ == "Simulation"
     assert isinstance(FrankaDriverConfig(world="air_hockey").simulation(), AirHockeyWorld)
+
+
+def test_touches_of_the_mallet_are_announced_when_they_have_ended(cell):
+    made = cell()
+    made.listen(Odometry, "franka_driver/touches")
+    made.connect()
+    made.advance(0.1)
+    for _ in range(2):
+        made.driver.simulation.place_puck((0.85, 0.0, 0.0), (-0.8, 0.0, 0.0))
+        made.driver.cell._touches = 0
+        made.advance(0.3)
+    events = made.received["franka_driver/touches"]
+    assert len(events) == 2
+    hit = read_state(events[0], SIMULATED, BASE)
+    assert hit.pose[0] == pytest.approx(0.65 + table.PUCK_RADIUS + table.MALLET_RADIUS, abs=5e-3)
+    assert 0.2 < hit.twist[0] < 0.8, "it comes back from the mallet"

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sim_bridge.demo import running
+from sim_bridge.demo.pushing import PushingDemo
 from sim_bridge.demo.scenario import Area, Phase, Scenario
-from sim_bridge.demo.verdict import Demo
 
 CAN_DISTANCE = 0.015
 """How near a can has to be: the planner rests within 8 mm of its estimate and resumes beyond 12 mm, and the
@@ -49,7 +49,7 @@ def success(summary: dict[str, Any]) -> str:
     )
 
 
-DEMO = Demo(
+DEMO = PushingDemo(
     "bimanual_push", "Two simulated FR3 push a can by a belief over where it is", can_scenario, success,
     strict=True,
 )  # fmt: skip

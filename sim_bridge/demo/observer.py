@@ -1,4 +1,4 @@
-"""A demo's own ROS node: records every topic, moves the target, lends the hand that knocks the object."""
+"""A demo's own ROS node: records every topic, and acts out what the demo's script says."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from sim_bridge.demo.scenario import Orders, Scenario
+from sim_bridge.demo.script import Script
 from sim_bridge.report.bag import BagRecorder
 from sim_bridge.report.overlay import MARKERS, Overlay, overlays_of
 from sim_bridge.report.recording import GOAL_POSE, GROUND_TRUTH, JOINT_STATES, JOINT_TRAJECTORY, planar
 from sim_bridge.spinning import Spinning
 from vpsto_ros.exceptions import VpstoError
-from vpsto_ros.robot.tool_plane import ToolPlane
 
-CLOCK, DISTURBANCE = "/clock", "/disturbance"
-DIAGNOSTICS = "/diagnostics"
-GOAL_PERIOD, GOAL_REPEAT = 0.05, 0.5
-"""How often a moving target is published, and one that stands, lest its one message be lost [s]."""
+CLOCK, DIAGNOSTICS = "/clock", "/diagnostics"
+GOALS, TOUCHES = "/franka_driver/goals", "/franka_driver/touches"
+GOAL_PROBABILITY = "/contact_planner/goal_probability"
 MOVING = 1e-3
 """A plan that moves no joint farther is no motion [rad]."""
 LATCHED = {
@@ -56,53 +55,51 @@ TOPICS = {
     "/object_state": Odometry,
     "/object_belief": PoseArray,
     "/external_wrench": WrenchStamped,
-    DISTURBANCE: WrenchStamped,
+    "/disturbance": WrenchStamped,
+    "/refused_contact": Odometry,
+    "/franka_driver/ground_truth/mallet": Odometry,
+    GOALS: Odometry,
+    TOUCHES: Odometry,
+    GOAL_PROBABILITY: Float64,
     DIAGNOSTICS: DiagnosticArray,
     **LATCHED,
 }
 
 
 class Observer(Node):
-    """Listens to everything without interpreting more than it must, and acts out a scenario.
+    """Listens to everything without interpreting more than it must, and acts out a script.
 
-    Messages stay serialised on their way into the bag; only what the scenario or a viewer needs is decoded.
+    Messages stay serialised on their way into the bag; only what the script or a viewer needs is decoded.
     """
 
-    def __init__(
-        self, bag: BagRecorder, scenario: Scenario, tools: ToolPlane, frame: str = "fr3_link0"
-    ) -> None:
+    def __init__(self, bag: BagRecorder, script: Script) -> None:
         """Subscribe to all topics.
 
         Args:
             bag: gets every message.
-            scenario: acted out once :meth:`begin` was called.
-            tools: the robot's tools, which the hand avoids.
-            frame: of all poses.
+            script: acted out once :meth:`begin` was called.
         """
         super().__init__("demo")
-        self._tools = tools
-        self._bag, self._scenario, self._frame = bag, scenario, frame
+        self._bag, self._script = bag, script
         self._latest: dict[str, bytes] = {}
         self._running = False
-        self._goal: NDArray[np.float64] | None = None
-        self._goal_published = -math.inf
         self.simulated_time = 0.0
         self.first_plan: float | None = None
         self._reported: dict[str, float] = {}
         self._informed: set[str] = set()
-        self._goals = self.create_publisher(PoseStamped, GOAL_POSE, QoSProfile(depth=1))
-        self._forces = self.create_publisher(WrenchStamped, DISTURBANCE, QoSProfile(depth=5))
+        self._listeners: dict[str, Callable[[Any], None]] = {}
+        script.connect(self)
         for topic, kind in TOPICS.items():
             bag.add_topic(topic, f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}")
             self.create_subscription(kind, topic, self._receiver(topic), _quality(topic), raw=True)
 
     def begin(self) -> None:
-        """Start the scenario with the next message about the object."""
+        """Start the script with the next message about the object."""
         self._running = True
 
-    def subscribers_of_goal(self) -> int:
-        """How many others listen to the target."""
-        return self._goals.get_subscription_count() - 1
+    def listen(self, topic: str, callback: Callable[[Any], None]) -> None:
+        """Call back with every message of one of the topics, while the script runs."""
+        self._listeners[topic] = callback
 
     def latest(self, topic: str) -> Any:
         """The newest message of a topic, or None."""
@@ -113,6 +110,11 @@ class Observer(Node):
         """The newest joint positions (n,) [rad], or None."""
         message = self.latest(JOINT_STATES)
         return None if message is None else np.array(message.position)
+
+    def joint_velocity(self) -> NDArray[np.float64] | None:
+        """The newest joint velocities (n,) [rad/s], or None."""
+        message = self.latest(JOINT_STATES)
+        return None if message is None else np.array(message.velocity)
 
     def object_pose(self) -> NDArray[np.float64] | None:
         """The newest true pose of the object: x, y [m] and yaw [rad], or None."""
@@ -127,10 +129,6 @@ class Observer(Node):
             found += overlays_of(message.markers, wanted, height) if message is not None else ()
         return tuple(found)
 
-    def goal(self) -> NDArray[np.float64] | None:
-        """The target's position (2,) [m], or None before the first one."""
-        return self._goal
-
     def _receiver(self, topic: str) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:
             if topic == CLOCK:
@@ -139,12 +137,14 @@ class Observer(Node):
                 self.simulated_time = seconds + 1e-9 * nanoseconds
             self._latest[topic] = data
             self._bag.write(topic, self.simulated_time, data)
-            if topic == JOINT_TRAJECTORY and self._goal is not None and self.first_plan is None:
+            if topic == JOINT_TRAJECTORY and self.first_plan is None and self._script.asked():
                 now = time.monotonic()
                 if moves(deserialize_message(data, JointTrajectory)):
                     self.first_plan = now
             if topic == DIAGNOSTICS:
                 self._note_report(deserialize_message(data, DiagnosticArray))
+            if self._running and topic in self._listeners:
+                self._listeners[topic](deserialize_message(data, TOPICS[topic]))
             if topic == GROUND_TRUTH and self._running:
                 self._act()
 
@@ -168,31 +168,9 @@ class Observer(Node):
                 self._informed.add(status.name)
 
     def _act(self) -> None:
-        message, joints = self.latest(GROUND_TRUTH), self.joints()
-        if joints is None or self._scenario.finished:
-            return
-        now = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        box = np.array(planar(message.pose.pose)[:2])
-        tools = self._tools.tips(joints)[:, :2]
-        self._carry_out(self._scenario.step(now, box, tools), now)
-
-    def _carry_out(self, orders: Orders, now: float) -> None:
-        changed = self._goal is None or not np.allclose(orders.goal, self._goal, atol=1e-9)
-        age = now - self._goal_published
-        if age >= GOAL_REPEAT or (changed and (not orders.goal_moves or age >= GOAL_PERIOD)):
-            self._goal, self._goal_published = orders.goal, now
-            message = PoseStamped()
-            message.header.frame_id = self._frame
-            message.header.stamp = _stamp(now)
-            message.pose.position.x, message.pose.position.y = map(float, orders.goal)
-            message.pose.orientation.w = 1.0
-            self._goals.publish(message)
-        if orders.force is not None:
-            wrench = WrenchStamped()
-            wrench.header.frame_id = self._frame
-            wrench.header.stamp = _stamp(now)
-            wrench.wrench.force.x, wrench.wrench.force.y = map(float, orders.force)
-            self._forces.publish(wrench)
+        stamp = self.latest(GROUND_TRUTH).header.stamp
+        if not self._script.finished:
+            self._script.act(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def moves(message: JointTrajectory) -> bool:
@@ -261,7 +239,8 @@ def _quality(topic: str) -> QoSProfile:
     return QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def _stamp(seconds: float) -> Any:
+def message_stamp(seconds: float) -> Any:
+    """A simulated time [s] as a message."""
     from builtin_interfaces.msg import Time
 
     whole = math.floor(seconds)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sim_bridge.demo import running
+from sim_bridge.demo.pushing import PushingDemo
 from sim_bridge.demo.scenario import Phase, Scenario
-from sim_bridge.demo.verdict import Demo
 
 
 def box_scenario(rng: np.random.Generator, duration: float = 90.0, drift_time: float = 12.0) -> Scenario:
@@ -45,7 +45,7 @@ def success(summary: dict[str, Any]) -> str:
     )
 
 
-DEMO = Demo("push_box", "A simulated FR3 pushes a box to a moving target", box_scenario, success)
+DEMO = PushingDemo("push_box", "A simulated FR3 pushes a box to a moving target", box_scenario, success)
 
 
 def run(arguments: argparse.Namespace) -> int:

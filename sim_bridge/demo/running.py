@@ -22,14 +22,13 @@ from sim_bridge.demo.artifacts import write_artifacts
 from sim_bridge.demo.live_view import live_view
 from sim_bridge.demo.observer import Activity, NodeThread, Observer
 from sim_bridge.demo.processes import ProcessGroup, private_network
-from sim_bridge.demo.scenario import Phase, Scenario
+from sim_bridge.demo.script import Script
 from sim_bridge.demo.settings import Settings
 from sim_bridge.demo.verdict import Demo, Outcome, give_up, verdict, write_summary
 from sim_bridge.report.bag import BagRecorder
 from sim_bridge.report.recording import Recording
-from sim_bridge.report.summary import DRIVER, PLANNER, RunFacts, summarize
+from sim_bridge.report.summary import DRIVER, PLANNER, RunFacts
 from vpsto_ros.exceptions import VpstoError
-from vpsto_ros.robot.tool_plane import ToolPlane
 
 NODES = {
     "franka_driver": "sim_bridge.franka_driver",
@@ -67,17 +66,17 @@ def run(demo: Demo, arguments: argparse.Namespace) -> int:
         outcome = _run_nodes(demo, arguments, settings, bag, out)
     finally:
         bag.close()
-    recording = Recording.from_bag(out / "bag", settings.scene.plant.height)
-    if recording.duration() < SHORTEST_RUN or math.isnan(outcome.scenario.phases[0].start):
+    script = outcome.script
+    recording = Recording.from_bag(out / "bag", demo.stage(settings).height)
+    if recording.duration(script.start) < SHORTEST_RUN:
         return give_up(out, arguments.seed, outcome)
     trouble = (outcome.first_plan, outcome.elapsed, outcome.trouble)
     facts = RunFacts(arguments.seed, *trouble, settings.planner_rate)
-    summary = summarize(recording, outcome.scenario, settings.tools, facts, strict=demo.strict)
+    summary = demo.summarize(recording, script, settings, facts)
     write_summary(out, summary)
     print("making pictures, replay and video ...", flush=True)
-    sentence = verdict(demo, summary)
-    notes = write_artifacts(out, recording, summary, settings, sentence, demo.title)
-    print(sentence)
+    notes = write_artifacts(out, demo, recording, summary, settings, script.start)
+    print(verdict(demo, summary))
     for note in notes:
         print(note)
     print(f"report: {out / 'report.html'}   bag for Foxglove: {out / 'bag'}")
@@ -88,8 +87,8 @@ def _run_nodes(
     demo: Demo, arguments: argparse.Namespace, settings: Settings, bag: BagRecorder, out: Path
 ) -> Outcome:
     """From the first process to the last."""
-    scenario = demo.scenario(np.random.default_rng(arguments.seed), arguments.duration)
-    outcome = Outcome(scenario)
+    script = demo.script(settings, np.random.default_rng(arguments.seed), arguments.duration)
+    outcome = Outcome(script)
     environment = private_network()
     began = time.monotonic()
     with ProcessGroup(out / "logs", environment) as processes:
@@ -98,20 +97,20 @@ def _run_nodes(
             processes.start(name, [sys.executable, "-c", code, *settings.ros_arguments(name)])
         # Whoever watches and records must not take time from those who plan and drive.
         os.nice(5)
-        with _observer(bag, scenario, settings.tools, environment) as (observer, spinning):
-            _wait_until_active(observer, spinning, processes)
-            with live_view(arguments.viewer, settings) as show:
+        with _observer(bag, script, environment) as (observer, spinning):
+            _wait_until_active(observer, spinning, processes, script)
+            with live_view(arguments.viewer, demo.stage(settings), lambda: demo.target(script)) as show:
                 started = time.monotonic()
                 observer.begin()
                 patience = 60.0 + 4.0 * arguments.duration / min(arguments.real_time_factor, 1.0)
-                _watch(observer, spinning, processes, scenario, show, started + patience)
+                _watch(observer, spinning, processes, script, show, started + patience)
             outcome.elapsed = time.monotonic() - started
-            _await_reports(observer, scenario)
+            _await_reports(observer, script)
             if observer.first_plan is not None:
                 outcome.first_plan = observer.first_plan - began
             ended = processes.ended()
-        if not scenario.finished and not ended:
-            outcome.trouble.append("the simulation did not get to the end of the scenario in time")
+        if not script.finished and not ended:
+            outcome.trouble.append("the simulation did not get to the end in time")
         processes.stop()
     outcome.trouble += _trouble(processes, ended)
     return outcome
@@ -131,11 +130,11 @@ def _trouble(processes: ProcessGroup, ended: Collection[str]) -> list[str]:
 
 @contextlib.contextmanager
 def _observer(
-    bag: BagRecorder, scenario: Scenario, tools: ToolPlane, environment: dict[str, str]
+    bag: BagRecorder, script: Script, environment: dict[str, str]
 ) -> Iterator[tuple[Observer, NodeThread]]:
     # Signals are ours: Ctrl-C must reach the code that stops the processes.
     rclpy.init(domain_id=int(environment["ROS_DOMAIN_ID"]), signal_handler_options=SignalHandlerOptions.NO)
-    observer = Observer(bag, scenario, tools)
+    observer = Observer(bag, script)
     try:
         with NodeThread(observer) as spinning:
             yield observer, spinning
@@ -144,14 +143,16 @@ def _observer(
         rclpy.try_shutdown()
 
 
-def _wait_until_active(observer: Observer, spinning: NodeThread, processes: ProcessGroup) -> None:
+def _wait_until_active(
+    observer: Observer, spinning: NodeThread, processes: ProcessGroup, script: Script
+) -> None:
     print("starting the nodes; the first time they compile for half a minute ...", flush=True)
     activity = Activity(observer, tuple(NODES))
     deadline = time.monotonic() + START_PATIENCE
-    # A planner that is told of a goal before it knows of the object would seem to miss its first cycles.
+    # A planner that is given a task before it knows of the object would seem to miss its first cycles.
     while not (
         activity.poll()
-        and observer.subscribers_of_goal() >= 2
+        and script.ready()
         and observer.object_pose() is not None
         and observer.informed(PLANNER)
     ):
@@ -165,10 +166,10 @@ def _wait_until_active(observer: Observer, spinning: NodeThread, processes: Proc
         time.sleep(0.02)
 
 
-def _await_reports(observer: Observer, scenario: Scenario) -> None:
-    """Wait for the diagnostics that see all of the scenario, but not for a node that hangs."""
+def _await_reports(observer: Observer, script: Script) -> None:
+    """Wait for the diagnostics that see all that happened, but not for a node that hangs."""
     deadline = time.monotonic() + REPORT_PATIENCE
-    end = scenario.phases[-1].end if scenario.finished else -math.inf
+    end = script.end if script.finished else -math.inf
     while not all(observer.reported_since(name, end) for name in (DRIVER, PLANNER)):
         if time.monotonic() > deadline:
             return
@@ -179,48 +180,31 @@ def _watch(
     observer: Observer,
     spinning: NodeThread,
     processes: ProcessGroup,
-    scenario: Scenario,
+    script: Script,
     show: Any,
     deadline: float,
 ) -> None:
-    """Show progress until the scenario is over, a process has ended or the deadline has passed.
+    """Show progress until the script is over, a process has ended or the deadline has passed.
 
     Raises:
         VpstoError: the observer failed.
     """
-    announced: set[str] = set()
     with tqdm(total=100, disable=None, bar_format="{desc} |{bar}| {elapsed}") as bar:
-        while not scenario.finished and not processes.ended() and time.monotonic() < deadline:
+        while not script.finished and not processes.ended() and time.monotonic() < deadline:
             time.sleep(0.05)
             spinning.check()
             show(observer)
-            _announce(scenario, announced)
-            pose, goal = observer.object_pose(), observer.goal()
-            if pose is not None and goal is not None:
-                distance = float(np.linalg.norm(pose[:2] - goal)) * 1e3
-                bar.set_description_str(
-                    f"{scenario.phase.name:9s} {distance:5.0f} mm to target", refresh=False
-                )
-            bar.n = round(100 * scenario.progress)
+            _tell(script)
+            bar.set_description_str(script.label(), refresh=False)
+            bar.n = round(100 * script.progress)
             bar.refresh()
     spinning.check()
-    _announce(scenario, announced)
+    _tell(script)
 
 
-def _announce(scenario: Scenario, announced: set[str]) -> None:
-    for phase in scenario.phases:
-        if math.isfinite(phase.end) and phase.name not in announced:
-            announced.add(phase.name)
-            tqdm.write(_sentence(phase, scenario))
-
-
-def _sentence(phase: Phase, scenario: Scenario) -> str:
-    if not phase.judged:
-        median = float(np.median(scenario.drift_distances)) * 1e3
-        return f"  {phase.name:9s}  the target moved at 2 cm/s; median distance {median:.0f} mm"
-    if math.isnan(phase.reached):
-        return f"  {phase.name:9s}  NOT reached within {phase.timeout:.0f} s"
-    return f"  {phase.name:9s}  reached after {phase.time_to_reach:.1f} s"
+def _tell(script: Script) -> None:
+    for sentence in script.news():
+        tqdm.write(sentence)
 
 
 def _interrupt(*_: object) -> None:

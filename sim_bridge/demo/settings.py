@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from sim_bridge.franka_driver import FrankaDriverConfig
+from sim_bridge.driver_config import FrankaDriverConfig
 from sim_bridge.scene import Scene
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
@@ -53,13 +53,18 @@ class Settings:
         return cls(file, seed, real_time_factor, driver, planner)
 
     @property
+    def base_frame(self) -> str:
+        """Frame of all poses."""
+        return self.driver.base_frame
+
+    @property
     def scene(self) -> Scene:
-        """The cell as the driver builds it."""
-        return self.driver.simulation().scene
+        """The cell of a pushing demo as the driver builds it."""
+        return self.driver.pushing().scene
 
     @property
     def tools(self) -> ToolPlane:
-        """The plane of the tools of the robot that is simulated."""
+        """The plane of the tools of a pushing demo's robot."""
         return self.driver.scene.plane()
 
     @property

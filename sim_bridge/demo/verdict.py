@@ -2,35 +2,70 @@
 
 from __future__ import annotations
 
+import abc
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sim_bridge.demo.scenario import Scenario
+from sim_bridge.demo.script import Script
+from sim_bridge.demo.settings import Settings
+from sim_bridge.report.page import Table
+from sim_bridge.report.recording import Recording
+from sim_bridge.report.stage import Stage
+from sim_bridge.report.summary import RunFacts
+
+Chart = tuple[Path, str]
+"""A picture and its caption."""
 
 
 @dataclass(frozen=True)
-class Demo:
+class Demo(abc.ABC):
     """What tells one demo from another.
 
     Attributes:
         name: of its file in ``config``.
         title: of its report.
-        scenario: what happens, from a source of randomness and the longest it may take [s].
-        success: what a good run achieved, in words, from its summary.
-        strict: whether contacts of the arms and refused trajectories are failures as well.
     """
 
     name: str
     title: str
-    scenario: Callable[[np.random.Generator, float], Scenario]
-    success: Callable[[dict[str, Any]], str]
-    strict: bool = False
+
+    @abc.abstractmethod
+    def script(self, settings: Settings, rng: np.random.Generator, duration: float) -> Script:
+        """What happens within a time [s]."""
+
+    @abc.abstractmethod
+    def stage(self, settings: Settings) -> Stage:
+        """What the run is drawn on."""
+
+    @abc.abstractmethod
+    def summarize(
+        self, recording: Recording, script: Any, settings: Settings, facts: RunFacts
+    ) -> dict[str, Any]:
+        """Everything that ``summary.json`` holds."""
+
+    @abc.abstractmethod
+    def success(self, summary: dict[str, Any]) -> str:
+        """What a good run achieved, in words."""
+
+    @abc.abstractmethod
+    def tables(self, summary: dict[str, Any]) -> list[Table]:
+        """The report's tables."""
+
+    @abc.abstractmethod
+    def charts(
+        self, out: Path, recording: Recording, summary: dict[str, Any], settings: Settings
+    ) -> list[Chart]:
+        """Draw the report's charts into a folder."""
+
+    def target(self, script: Any) -> NDArray[np.float64] | None:
+        """Where the object is to go (2,) [m], for the live view; None where there is no such place."""
+        return None
 
 
 @dataclass
@@ -38,13 +73,13 @@ class Outcome:
     """What the run itself leaves for the summary.
 
     Attributes:
-        scenario: with the phases as they went.
+        script: with what happened.
         first_plan: from the start of the processes to the first plan [s].
-        elapsed: wall time of the scenario [s].
+        elapsed: wall time of the script [s].
         trouble: what went wrong with the processes, in words.
     """
 
-    scenario: Scenario
+    script: Script
     first_plan: float = math.nan
     elapsed: float = math.nan
     trouble: list[str] = field(default_factory=list)

@@ -9,6 +9,7 @@ from visualization_msgs.msg import MarkerArray
 
 from sim_bridge.driver_config import FrankaDriverConfig
 from sim_bridge.hockey import messages
+from sim_bridge.hockey.contact_log import MALLET
 from sim_bridge.hockey.rules import KINDS
 from sim_bridge.hockey.world import AirHockeyWorld, Goal
 from vpsto_ros.exceptions import InvalidInputError
@@ -36,8 +37,10 @@ class AirHockeyCell:
         self._pucks = 0
         self._goals = {"far": 0, "near": 0}
         self._announced: Goal | None = None
+        self._touches = 0  # of the mallet, since the puck was put down
         self._mallet_publisher = node.advertise(Odometry, "~/ground_truth/mallet", best_effort(1))
         self._goal_publisher = node.advertise(Odometry, "~/goals", reliable(10))
+        self._touch_publisher = node.advertise(Odometry, "~/touches", reliable(10))
         node.serve(Trigger, "~/new_puck", self._new_puck_requested)
 
     @staticmethod
@@ -49,7 +52,11 @@ class AirHockeyCell:
         """Nothing acts besides the arm."""
 
     def after_slice(self) -> None:
-        """Announce a goal."""
+        """Announce the end of a touch of the mallet, and a goal."""
+        touches = [contact for contact in self.world.contacts if contact.surface == MALLET]
+        for contact in touches[self._touches :]:
+            self._touch_publisher.publish(messages.touch_event(contact, self._config.base_frame))
+        self._touches = len(touches)
         goal = self.world.goal
         if goal is not None and goal is not self._announced:
             self._announced = goal
@@ -88,6 +95,7 @@ class AirHockeyCell:
         moves = np.abs(world.follower.reference(world.time)[1]).max() > AT_REST
         if not moves:
             world.reset()
+            self._touches = 0
         self._put_puck()
         arm = "moves, and goes on" if moves else "is back where it started"
         return f"a new puck is on the table, the arm {arm}; time goes on"
@@ -105,7 +113,7 @@ class AirHockeyCell:
             except InvalidInputError as error:
                 refused = error
                 continue
-            self._pucks += 1
+            self._pucks, self._touches = self._pucks + 1, 0
             return f"a puck is at ({pose[0]:.3f}, {pose[1]:.3f}) m"
         raise refused
 

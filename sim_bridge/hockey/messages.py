@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.hockey import table
+from sim_bridge.hockey.contact_log import PuckContact
 from sim_bridge.hockey.world import AirHockeyWorld, Goal
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import SIMULATED, planar_pose
@@ -22,6 +23,15 @@ def goal_event(goal: Goal, frame: str) -> Odometry:
     message.header.stamp, message.header.frame_id = SIMULATED.stamp(goal.time), frame
     message.pose.pose = planar_pose(np.append(goal.position, 0.0), table.TABLE_ORIGIN[2])
     message.twist.twist.linear.x, message.twist.twist.linear.y = map(float, goal.velocity)
+    return message
+
+
+def touch_event(contact: PuckContact, frame: str) -> Odometry:
+    """A touch of the mallet: where the puck was hit, and how it moves afterwards, in the axes of the base."""
+    message = Odometry(child_frame_id=MALLET_FRAME)
+    message.header.stamp, message.header.frame_id = SIMULATED.stamp(contact.end), frame
+    message.pose.pose = planar_pose(contact.pose, table.TABLE_ORIGIN[2])
+    message.twist.twist.linear.x, message.twist.twist.linear.y = map(float, contact.velocity_after[:2])
     return message
 
 

@@ -61,11 +61,11 @@ class Strike:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> "Strike":
-        """One on the robot's half of the table."""
+        """One on the robot's half of the table, more often near the puck's middle, as who shoots hits it."""
         return cls(
             place=rng.uniform((-0.65, -0.35), (-0.2, 0.35)), angle=rng.uniform(-1.2, 1.2),
             speed=rng.uniform(0.3, 1.4), length=rng.uniform(0.15, 0.35), phase=rng.uniform(0.4, 0.65),
-            aside=rng.uniform(-0.05, 0.05), puck_velocity=rng.normal(0.0, 0.2, 2),
+            aside=rng.uniform(-0.05, 0.05) * rng.random(), puck_velocity=rng.normal(0.0, 0.2, 2),
         )  # fmt: skip
 
     @property

@@ -92,4 +92,4 @@ def describe(model: PuckModel, factors: dict[str, float]) -> str:
 
 
 def _growing(mode: LinearGaussian) -> str:
-    return f" at 1 m/s, {100 * mode.growth:g} % of the variance grows" if mode.growth else ""
+    return " at 1 m/s" if mode.growth.any() else ""

@@ -23,12 +23,16 @@ img { width: 100%; } figure { margin: 1rem 0; } figcaption { color: #6b7280; fon
 """
 
 
+Table = tuple[str, list[list[str]]]
+"""A heading and rows; the first row names the columns."""
+
+
 def write_page(
     path: Path,
     title: str,
     verdict: str,
     success: bool,
-    tables: Sequence[tuple[str, Sequence[Sequence[str]]]],
+    tables: Sequence[Table],
     charts: Sequence[tuple[Path, str]],
     replay: str | None,
 ) -> None:
@@ -56,29 +60,17 @@ def write_page(
     path.write_text(f"<!doctype html><html lang='en'><head>{head}</head><body>{''.join(body)}</body></html>")
 
 
-def demo_tables(summary: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """The tables of a demo's report from its summary."""
-    mpc = summary["mpc"]
-    compute = mpc["compute_ms"]
+def push_tables(summary: Mapping[str, Any]) -> list[Table]:
+    """The tables of a pushing demo's report from its summary."""
     figures = [
         ["figure", "value"],
         ["final distance to the target", number(summary["final_error_m"], 1e3, "mm", 1)],
         *_drift_row(summary),
         ["limit violations", str(summary["limit_violations"])],
         *_contact_row(summary),
-        ["trajectories that the controller refused", _count(summary["refused_trajectories"])],
+        ["trajectories that the controller refused", count(summary["refused_trajectories"])],
         ["largest deviation of a tool's height", number(summary["tool_height_deviation_m"], 1e3, "mm", 2)],
-        ["plans per simulated second", number(mpc["rate_hz"], 1.0, "Hz", 1)],
-        [
-            "compute time p50 / p99 / max",
-            " / ".join(number(compute[key], 1.0, "", 1) for key in compute) + " ms",
-        ],
-        [
-            "deadlines missed",
-            f"{number(mpc['deadline_misses'], 1.0, '', 0)} of {number(mpc['cycles'], 1.0, '', 0)}",
-        ],
-        ["from start to the first plan", number(summary["time_to_first_plan_s"], 1.0, "s", 1)],
-        ["simulated time", number(summary["simulated_s"], 1.0, "s", 1)],
+        *planning_rows(summary),
     ]
     phases = [["phase", "began at", "time to reach"]]
     begin = summary["phases"][0]["start_s"]
@@ -86,6 +78,21 @@ def demo_tables(summary: Mapping[str, Any]) -> list[tuple[str, list[list[str]]]]
         reach = number(phase["time_to_reach_s"], 1.0, "s", 1) if phase["judged"] else "–"
         phases.append([phase["name"], number(phase["start_s"] - begin, 1.0, "s", 1), reach])
     return [("What was measured", figures), ("What happened", phases)]
+
+
+def planning_rows(summary: Mapping[str, Any]) -> list[list[str]]:
+    """How the planner kept its time, in every demo."""
+    mpc = summary["mpc"]
+    compute = mpc["compute_ms"]
+    times = " / ".join(number(compute[key], 1.0, "", 1) for key in compute)
+    missed, cycles = (number(mpc[key], 1.0, "", 0) for key in ("deadline_misses", "cycles"))
+    return [
+        ["plans per simulated second", number(mpc["rate_hz"], 1.0, "Hz", 1)],
+        ["compute time p50 / p99 / max", f"{times} ms"],
+        ["deadlines missed", f"{missed} of {cycles}"],
+        ["from start to the first plan", number(summary["time_to_first_plan_s"], 1.0, "s", 1)],
+        ["simulated time", number(summary["simulated_s"], 1.0, "s", 1)],
+    ]
 
 
 def _drift_row(summary: Mapping[str, Any]) -> list[list[str]]:
@@ -102,7 +109,8 @@ def _contact_row(summary: Mapping[str, Any]) -> list[list[str]]:
     return [["what arms touched that they should not", ", ".join(shown) or "unknown"]]
 
 
-def _count(value: int | None) -> str:
+def count(value: int | None) -> str:
+    """A number of things for people, "unknown" when nobody counted."""
     return "unknown" if value is None else str(value)
 
 

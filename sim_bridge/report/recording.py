@@ -146,12 +146,10 @@ class Recording:
         known = np.isfinite(distance)
         return self.object.time[known], distance[known]
 
-    def duration(self) -> float:
-        """How long joints and object were recorded with a target [s]; 0 when one is missing."""
-        time, _ = self.distance()
-        if not len(time) or not len(self.joints.time):
-            return 0.0
-        return max(float(min(time[-1], self.joints.time[-1]) - time[0]), 0.0)
+    def duration(self, start: float) -> float:
+        """How long joints and object were recorded from a time [s] on; 0 when one is missing."""
+        ends = [series.time[-1] for series in (self.joints, self.object) if len(series.time)]
+        return max(float(min(ends) - start), 0.0) if len(ends) == 2 and math.isfinite(start) else 0.0
 
 
 class _Reader:

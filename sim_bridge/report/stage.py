@@ -103,7 +103,7 @@ class AirHockeyStage:
     scene: hockey.AirHockeyScene
     joint_names = JOINT_NAMES
     height = table.PUCK_HEIGHT
-    viewpoint = Viewpoint((0.35, -1.75, 1.75), (1.3, 0.05, 0.1), math.radians(44.0))
+    viewpoint = Viewpoint((0.4, -1.9, 1.8), (1.12, 0.0, 0.17), math.radians(44.0))
 
     def build(self) -> mujoco.MjModel:
         """The model of the simulation with light and a camera."""

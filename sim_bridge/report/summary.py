@@ -55,32 +55,49 @@ def summarize(
         strict: whether contacts of the arms and refused trajectories are failures as well.
     """
     _, distance = recording.distance()
-    limits = limit_violations(recording, tools.robot)
     heights = tools.tool_heights(recording.joints.position)
     start, end = scenario.phases[0].start, scenario.phases[-1].end
     if not math.isfinite(end):
         end = recording.object.time[-1]
     summary: dict[str, Any] = {
-        "success": False,
-        "failures": [],
+        **common_figures(recording, tools.robot, start, end, facts),
         "final_error_m": float(distance[-1]),
-        "limit_violations": sum(limits.values()),
-        "limit_violations_by_kind": limits,
-        "mpc": planner_figures(recording, start, end, facts.planner_rate),
-        "time_to_first_plan_s": facts.first_plan,
         "tool_height_deviation_m": float(np.abs(heights - tools.height).max()),
         "reached_distance_m": scenario.reached_distance,
         "phases": [_phase_figures(phase) for phase in scenario.phases],
         **_drift_figures(scenario),
-        **driver_counts(recording.diagnostics.get(DRIVER, []), start),
-        "seed": facts.seed,
-        "simulated_s": float(end - start),
-        "real_time_factor": float((end - start) / facts.elapsed) if facts.elapsed > 0.0 else math.nan,
     }
     found = failures(summary) + (strict_failures(summary) if strict else [])
     summary["failures"] = [*found, *facts.trouble]
     summary["success"] = not summary["failures"]
     return summary
+
+
+def common_figures(
+    recording: Recording, robot: Robot, start: float, end: float, facts: RunFacts
+) -> dict[str, Any]:
+    """What the summary of every demo holds; success is still open.
+
+    Args:
+        recording: the run.
+        robot: whose limits count.
+        start: when the robot was first given something to do [s].
+        end: of all that happened [s].
+        facts: what the recording cannot tell.
+    """
+    limits = limit_violations(recording, robot)
+    return {
+        "success": False,
+        "failures": [],
+        "limit_violations": sum(limits.values()),
+        "limit_violations_by_kind": limits,
+        "mpc": planner_figures(recording, start, end, facts.planner_rate),
+        "time_to_first_plan_s": facts.first_plan,
+        **driver_counts(recording.diagnostics.get(DRIVER, []), start),
+        "seed": facts.seed,
+        "simulated_s": float(end - start),
+        "real_time_factor": float((end - start) / facts.elapsed) if facts.elapsed > 0.0 else math.nan,
+    }
 
 
 def limit_violations(recording: Recording, robot: Robot) -> dict[str, int]:
@@ -198,15 +215,22 @@ def failures(summary: Mapping[str, Any]) -> list[str]:
         drift, most = summary["drift"]["median_distance_m"], DRIFT_MEDIAN_DISTANCE
         if not drift <= most:
             found.append(f"drift: median distance {drift * 1e3:.0f} mm, allowed are {most * 1e3:.0f} mm")
+    found.extend(common_failures(summary))
+    deviation = summary["tool_height_deviation_m"]
+    if not deviation <= ALLOWED_HEIGHT_DEVIATION:
+        found.append(f"the tool left its height by {deviation * 1e3:.1f} mm, allowed are 5 mm")
+    return found
+
+
+def common_failures(summary: Mapping[str, Any]) -> list[str]:
+    """What keeps a run of any demo from being a success: limits that were broken, a planner that was late."""
+    found = []
     if summary["limit_violations"]:
         kinds = [kind for kind, count in summary["limit_violations_by_kind"].items() if count]
         found.append(f"{summary['limit_violations']} limit violations ({', '.join(kinds)})")
     if "driver_other" not in summary["limit_violations_by_kind"]:
         found.append("the driver did not say whether it saw limits violated")
     found.extend(planner_failures(summary["mpc"]))
-    deviation = summary["tool_height_deviation_m"]
-    if not deviation <= ALLOWED_HEIGHT_DEVIATION:
-        found.append(f"the tool left its height by {deviation * 1e3:.1f} mm, allowed are 5 mm")
     return found
 
 

@@ -23,8 +23,12 @@ FORMAT = "vpsto_ros puck model 2"
 SHIPPED = pathlib.Path(__file__).parent / "models" / "puck.json"
 """The model of the simulated world, which comes with the package; its origin is in the file."""
 MODES = ("floating", "wall", "mallet")
-APPROACH = {"floating": None, "wall": (-1.0, 0.0), "mallet": (-1.0, 0.0, 1.0, 0.0)}
-"""The speed that each mode's scatter may grow with, as a row of its inputs: how fast bodies close in."""
+APPROACH: dict[str, tuple[tuple[float, ...], ...]] = {
+    "floating": (),
+    "wall": ((-1.0, 0.0), (0.0, 1.0)),
+    "mallet": ((-1.0, 0.0, 1.0, 0.0), (0.0, -1.0, 0.0, 1.0)),
+}
+"""Speeds that each mode's scatter may grow with, rows of its inputs: how fast bodies close in, and slip."""
 _INPUTS = {"floating": 2, "wall": 2, "mallet": 4}
 _TABLE_STEPS = 256  # of floating that are made at once
 
@@ -134,7 +138,7 @@ class PuckModel:
     def step(
         self, mean: ArrayLike, covariance: ArrayLike, duration: float | None = None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """One step of (5.8), or a part of one: mean (4,) and covariance (4, 4) afterwards.
+        """One step of (5.8), or a part of one [s]: mean (4,) and covariance (4, 4) afterwards.
 
         Deviation: a wall is met at its time, which the state's uncertainty shifts, instead of at a step. Both
         kinds of bounces are taken together, as the Gaussian with the mean and covariance of their mixture.
@@ -144,6 +148,21 @@ class PuckModel:
         spread = np.array(covariance, dtype=float)
         puck_modes.step(self.kernel_rows, part, state, spread)
         return state, spread
+
+    def split_step(
+        self, mean: ArrayLike, covariance: ArrayLike, duration: float | None = None
+    ) -> list[tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
+        """:meth:`step` with usual and lively bounces apart: (share, mean, covariance) of each."""
+        if self.lively is None:
+            return [(1.0, *self.step(mean, covariance, duration))]
+        part, found = 1.0 if duration is None else duration / self.period, []
+        shares = {puck_modes.WALL: 1.0 - self.lively_share, puck_modes.LIVELY: self.lively_share}
+        for kind, share in shares.items():
+            state, spread = np.array(mean, dtype=float), np.array(covariance, dtype=float)
+            if not puck_modes.step(self.kernel_rows, part, state, spread, kind):
+                return [(1.0, state, spread)]
+            found.append((share, state, spread))
+        return found
 
     def predict(
         self, mean: ArrayLike, covariance: ArrayLike, times: ArrayLike
@@ -279,12 +298,13 @@ class PuckModel:
 
     @functools.cached_property
     def kernel_rows(self) -> NDArray[np.float64]:
-        """The model as rows of numbers for the compiled rollouts, shape (30, 2)."""
+        """The model as rows of numbers for the compiled rollouts, shape (34, 2)."""
         table = self.table
         rows = [[self.period, table.opening], table.reach, [self.hit_delay, self.lively_share]]
         rows.append([table.contact_distance, table.puck_radius + table.post_radius])
         for mode in (self.floating, self.wall, self.lively or self.wall, self.mallet):
-            rows += [*mode.matrix[:, :2], mode.offset, *mode.covariance, [mode.growth, 0.0]]
+            rows += [*mode.matrix[:, :2], mode.offset, *mode.covariance]
+            rows += [*mode.growth] if mode.growth.any() else [[0.0, 0.0], [0.0, 0.0]]
         return np.array([*rows, *self.mallet.matrix[:, 2:]])
 
     @functools.cached_property
@@ -353,10 +373,10 @@ def _check_mode(name: str, kind: str, mode: LinearGaussian) -> None:
     shape, expected = mode.matrix.shape, (2, _INPUTS[kind])
     if shape != expected:
         raise InvalidInputError(f"the {name} mode needs a matrix {expected}, got {shape}")
-    if mode.growth > 0.0 and not np.array_equal(mode.approach, APPROACH[kind] or ()):
+    if mode.growth.any() and not np.array_equal(mode.approach, APPROACH[kind]):
         raise InvalidInputError(
-            f"the scatter of the {name} mode may only grow with {APPROACH[kind]} of its inputs, the speed of "
-            f"approach, got {mode.approach.tolist()}"
+            f"the scatter of the {name} mode may only grow with {APPROACH[kind]} of its inputs, the speeds "
+            f"of approach, got {mode.approach.tolist()}"
         )
 
 

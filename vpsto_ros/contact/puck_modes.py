@@ -2,8 +2,8 @@
 
 A model is an array of rows, each of two numbers: (period, opening), reach, (delay of hits, share of lively
 bounces), (contact distance, radius of the posts with the puck's), and for floating, wall, lively wall and
-mallet six rows: matrix (2 rows; for the mallet that of the puck's velocity), offset, covariance (2 rows),
-(growth, 0); at last the matrix of the mallet's velocity; see
+mallet seven rows: matrix (2 rows; for the mallet that of the puck's velocity), offset, covariance (2 rows),
+growth (2 rows); at last the matrix of the mallet's velocity; see
 :attr:`vpsto_ros.contact.puck.PuckModel.kernel_rows`.
 
 Nothing is allocated here: planners look at thousands of shots at once. A work array has shape (8, 4).
@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit
 
-FLOATING, WALL, LIVELY, MALLET, STRIKER, ROWS = 4, 10, 16, 22, 28, 30
+FLOATING, WALL, LIVELY, MALLET, STRIKER, ROWS = 4, 11, 18, 25, 32, 34
 """First row of each mode, of the matrix of the mallet's velocity, and how many rows there are."""
 MERGED = 0
 """Both kinds of bounces as one Gaussian; else WALL or LIVELY."""
@@ -69,10 +69,21 @@ def _identity(a):
 
 
 @njit(cache=True, nogil=True)
-def scale(model, mode, speed, variance):
-    """By what the covariance of a mode is multiplied at a speed of approach that is known so well."""
-    growth = model[mode + 5, 0]
-    return 1.0 - growth + growth * (speed * speed + variance)
+def scales(model, mode, normal, tangential):
+    """By what standard deviations of a mode are multiplied along normal and tangent.
+
+    Args:
+        model: rows.
+        mode: first row of it.
+        normal: mean square of the speed with which the bodies close in.
+        tangential: and with which they slip.
+    """
+    a, b = model[mode + 5, 0], model[mode + 5, 1]
+    c, d = model[mode + 6, 0], model[mode + 6, 1]
+    return (
+        math.sqrt(1.0 - a - b + a * normal + b * tangential),
+        math.sqrt(1.0 - c - d + c * normal + d * tangential),
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -105,7 +116,7 @@ def _expected(model, row, normal, tangential):
 
 
 @njit(cache=True, nogil=True)
-def bounce_law(model, kind, normal, tangential, variance):
+def bounce_law(model, kind, normal, tangential, normal_variance, tangential_variance):
     """What a bounce does to a velocity in the frame of contact, (5.2).
 
     Args:
@@ -113,25 +124,27 @@ def bounce_law(model, kind, normal, tangential, variance):
         kind: WALL, LIVELY, or MERGED: their mixture as one Gaussian.
         normal: velocity before it along the normal.
         tangential: and along the tangent.
-        variance: of the velocity along the normal.
+        normal_variance: of the first.
+        tangential_variance: of the second.
 
     Returns:
         Matrix by rows (4 numbers), velocity afterwards (2), covariance (nn, nt, tt).
     """
     row = LIVELY if kind == LIVELY else WALL
-    s = scale(model, row, normal, variance)
+    squares = normal * normal + normal_variance, tangential * tangential + tangential_variance
+    sn, st = scales(model, row, squares[0], squares[1])
     m00, m01, m10, m11 = model[row, 0], model[row, 1], model[row + 1, 0], model[row + 1, 1]
     n, t = _expected(model, row, normal, tangential)
-    nn, nt, tt = s * model[row + 3, 0], s * model[row + 3, 1], s * model[row + 4, 1]
+    nn, nt, tt = sn * sn * model[row + 3, 0], sn * st * model[row + 3, 1], st * st * model[row + 4, 1]
     share = model[2, 1]
     if kind == MERGED and share > 0.0:
         b, rest = LIVELY, 1.0 - share
-        s = scale(model, b, normal, variance)
+        sn, st = scales(model, b, squares[0], squares[1])
         n2, t2 = _expected(model, b, normal, tangential)
         dn, dt, both = n2 - n, t2 - t, share * rest
-        nn = rest * nn + share * s * model[b + 3, 0] + both * dn * dn
-        nt = rest * nt + share * s * model[b + 3, 1] + both * dn * dt
-        tt = rest * tt + share * s * model[b + 4, 1] + both * dt * dt
+        nn = rest * nn + share * sn * sn * model[b + 3, 0] + both * dn * dn
+        nt = rest * nt + share * sn * st * model[b + 3, 1] + both * dn * dt
+        tt = rest * tt + share * st * st * model[b + 4, 1] + both * dt * dt
         m00, m01 = rest * m00 + share * model[b, 0], rest * m01 + share * model[b, 1]
         m10, m11 = rest * m10 + share * model[b + 1, 0], rest * m11 + share * model[b + 1, 1]
         n, t = n + share * dn, t + share * dt
@@ -149,7 +162,8 @@ def bounce(model, kind, time, rest, axis, side, mean, covariance, work):
     into, along = -side, (-side if axis == 0 else side)
     vn, vt = mean[2 + axis], mean[2 + other]
     m00, m01, m10, m11, n, t, nn, nt, tt = bounce_law(
-        model, kind, into * vn, along * vt, covariance[2 + axis, 2 + axis]
+        model, kind, into * vn, along * vt, covariance[2 + axis, 2 + axis],
+        covariance[2 + other, 2 + other],
     )
     n, t = into * n, along * t
     m01, m10, nt = into * along * m01, into * along * m10, into * along * nt
@@ -176,21 +190,30 @@ def bounce(model, kind, time, rest, axis, side, mean, covariance, work):
 
 
 @njit(cache=True, nogil=True)
-def advance(model, part, mean, covariance, work):
-    """Advance mean (4,) and covariance (4, 4) in place by a part of a step; whether a wall was met."""
+def advance(model, part, mean, covariance, work, kind=MERGED):
+    """Advance mean (4,) and covariance (4, 4) in place by a part of a step; whether a wall was met.
+
+    Args:
+        model: rows.
+        part: of a step.
+        mean: state.
+        covariance: of it.
+        work: space.
+        kind: of the bounce if there is one: MERGED, WALL or LIVELY.
+    """
     duration = part * model[0, 0]
     time, axis, side = next_wall(model, mean[0], mean[1], mean[2], mean[3], duration)
     if axis < 0:
         float_on(model, part, mean, covariance, work)
     else:
-        bounce(model, MERGED, time, duration - time, axis, side, mean, covariance, work)
+        bounce(model, kind, time, duration - time, axis, side, mean, covariance, work)
     return axis >= 0
 
 
 @njit(cache=True, nogil=True)
-def step(model, part, mean, covariance):
+def step(model, part, mean, covariance, kind=MERGED):
     """:func:`advance` for callers without a work array."""
-    return advance(model, part, mean, covariance, np.empty((8, 4)))
+    return advance(model, part, mean, covariance, np.empty((8, 4)), kind)
 
 
 @njit(cache=True, nogil=True)
@@ -219,10 +242,11 @@ def hit(model, delay, striker, mean, covariance, work):
     wn += model[STRIKER, 0] * un + model[STRIKER, 1] * ut
     wt += model[STRIKER + 1, 0] * un + model[STRIKER + 1, 1] * ut
     wx, wy = nx * wn - ny * wt, ny * wn + nx * wt
-    variance = (
-        nx * nx * covariance[2, 2] + 2.0 * nx * ny * covariance[2, 3] + ny * ny * covariance[3, 3]
-    )
-    s = scale(model, f, un - vn, variance)
+    xx, both, yy = covariance[2, 2], 2.0 * nx * ny * covariance[2, 3], covariance[3, 3]
+    sn, st = scales(
+        model, f, (un - vn) ** 2 + nx * nx * xx + both + ny * ny * yy,
+        (ut - vt) ** 2 + ny * ny * xx - both + nx * nx * yy,
+    )  # fmt: skip
     # What turning the normal by an angle does to the velocity afterwards, J w + F Theta (J F)' (v, u):
     gn = -wt + model[f, 0] * vt - model[f, 1] * vn + model[STRIKER, 0] * ut - model[STRIKER, 1] * un
     gt = wn + model[f + 1, 0] * vt - model[f + 1, 1] * vn
@@ -252,7 +276,7 @@ def hit(model, delay, striker, mean, covariance, work):
     mean[0] -= delay * (wx - vx)
     mean[1] -= delay * (wy - vy)
     mean[2], mean[3] = wx, wy
-    nn, nt, tt = s * model[f + 3, 0], s * model[f + 3, 1], s * model[f + 4, 1]
+    nn, nt, tt = sn * sn * model[f + 3, 0], sn * st * model[f + 3, 1], st * st * model[f + 4, 1]
     xx = nx * nx * nn - 2.0 * nx * ny * nt + ny * ny * tt
     xy = nx * ny * (nn - tt) + (nx * nx - ny * ny) * nt
     yy = ny * ny * nn + 2.0 * nx * ny * nt + nx * nx * tt

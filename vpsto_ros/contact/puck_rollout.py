@@ -22,7 +22,7 @@ from vpsto_ros.contact.puck_modes import (
     goal_window,
     hit,
     next_wall,
-    scale,
+    scales,
     transform,
 )
 
@@ -309,11 +309,12 @@ def sampled(model, starts, noise, choice, found):
                 into, along = -side, (-side if axis == 0 else side)
                 normal, tangential = (into * vx, along * vy) if axis == 0 else (into * vy, along * vx)
             a, b, c = _factor(model, row)
-            size = math.sqrt(scale(model, row, normal, 0.0))
-            first, second = size * noise[s, k, 0], size * noise[s, k, 1]
-            n = model[row, 0] * normal + model[row, 1] * tangential + model[row + 2, 0] + a * first
+            sn, st = scales(model, row, normal * normal, tangential * tangential)
+            first, second = noise[s, k, 0], noise[s, k, 1]
+            n = model[row, 0] * normal + model[row, 1] * tangential + model[row + 2, 0]
             t = model[row + 1, 0] * normal + model[row + 1, 1] * tangential + model[row + 2, 1]
-            t += b * first + c * second
+            n += sn * a * first
+            t += st * (b * first + c * second)
             wx, wy = (into * n, along * t) if axis != 1 else (along * t, into * n)
             if axis < 0:
                 time = 0.5 * period

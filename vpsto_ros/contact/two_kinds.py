@@ -64,7 +64,7 @@ def fit_two_kinds(
     Args:
         outputs: y, shape (N, m).
         inputs: xi, shape (N, n).
-        approach: of the speed that the scatter may grow with, shape (n,).
+        approach: speeds that the scatter may grow with, shape (f, n).
         least_std: of every output, as for :meth:`LinearGaussian.fit`.
         copies: how often each sample is among the N, mirrored say.
 
@@ -72,10 +72,10 @@ def fit_two_kinds(
         InvalidInputError: there are too few samples for one kind.
     """
     single = TwoKinds(LinearGaussian.fit(outputs, inputs, least_std=least_std, approach=approach))
-    parameters = inputs.shape[1] + 4  # of another kind: matrix, offset, variance, growth and its share
+    parameters = inputs.shape[1] + 3 + len(approach)  # another row, offset, variance and growth, a share
     needed = copies * 0.5 * parameters * math.log(len(outputs) / copies)  # Schwarz's criterion
     best, reached = single, single.log_likelihood(outputs, inputs) + needed
-    off = (outputs - single.usual.mean(inputs))[:, 0] / np.sqrt(single.usual.scales(inputs))
+    off = (outputs - single.usual.mean(inputs))[:, 0] / np.sqrt(single.usual.scales(inputs)[:, 0])
     for side in (1.0, -1.0):
         start = side * off > np.quantile(side * off, 1.0 - _RARE)
         try:
@@ -113,5 +113,5 @@ def _improved(
 def _first(model: LinearGaussian) -> LinearGaussian:
     """Of the first output alone."""
     return LinearGaussian(
-        model.matrix[:1], model.offset[:1], model.covariance[:1, :1], model.growth, model.approach
+        model.matrix[:1], model.offset[:1], model.covariance[:1, :1], model.growth[:1], model.approach
     )

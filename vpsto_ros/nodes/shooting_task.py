@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from std_msgs.msg import Float64
 from visualization_msgs.msg import Marker
 
 from vpsto_ros.estimation.puck_filter import PuckState
@@ -13,7 +14,7 @@ from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNo
 from vpsto_ros.nodes.conversions import contact_message, read_state
 from vpsto_ros.nodes.hockey_table import strike_table
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
-from vpsto_ros.nodes.lifecycle import ManagedNode
+from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.shooting import SETTINGS, ShootingPlanner, Shot
@@ -40,6 +41,7 @@ class ShootingContacts:
         self.planner = ShootingPlanner(self._model, strikes, shooting)
         self._warm_up(np.array(strikes.rules.home))
         self.forget()
+        self._chances = node.advertise(Float64, "~/goal_probability", reliable(1))
         node.subscribe(Odometry, "object_state", self._receive_object)
         node.subscribe(Odometry, "refused_contact", self._receive_refusal)
 
@@ -71,6 +73,7 @@ class ShootingContacts:
         shot = self.planner.plan(now, self.puck, joints)
         if shot is None:
             return []
+        self._chances.publish(Float64(data=shot.goal))
         covariance = self._seen(shot).at_touch[:2, :2] + _LEAST_VARIANCE * np.eye(2)
         place, frame = self._table.to_base(shot.mallet[:2]), self._config.base_frame
         touch = ContactPlan(shot.time, place, shot.mallet[2:], covariance)
@@ -105,7 +108,7 @@ class ShootingContacts:
         """Drop a shot that the arm has no motion for; what comes later is another one."""
         time, shot = self._node.seconds(message.header.stamp, CONTACT_AHEAD), self.planner.committed
         if shot is not None and abs(time - shot.time) < SAME_SHOT:
-            self.planner.forget()
+            self.planner.refuse()
             words = "the arm has no motion for the shot; another is sought"
             self._node.complaints.add("refused_contact", words)
 
@@ -113,9 +116,8 @@ class ShootingContacts:
         """Compile whatever shots use: a round over all contact times, and a look at the result."""
         puck = PuckState(0.0, np.array([-0.5, 0.0, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
         for index in range(30):
-            self.puck = dataclasses.replace(puck, stamp=0.02 * index)
-            self.plan(0.02 * index, home)
-        preview(self._model, self.planner.config, puck, None)
+            shot = self.planner.plan(0.02 * index, dataclasses.replace(puck, stamp=0.02 * index), home)
+            preview(self._model, self.planner.config, puck, shot)
 
     def markers(self, make: markers.MarkerFactory) -> list[Marker]:
         """The way of the puck that is expected with its ellipses of two standard deviations, and the shot."""

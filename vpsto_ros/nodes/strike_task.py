@@ -1,5 +1,7 @@
 """Strikes as a task of the node that moves the arm: contact_plan of the mallet in place of an object."""
 
+import dataclasses
+
 import numpy as np
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
@@ -13,9 +15,11 @@ from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.planning.running_reference import MpcStep
+from vpsto_ros.planning.stitching import extended
 from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 
+_SHORTEST = 0.2  # trajectories last at least so long [s]
 _LATE = 0.2  # a contact that was due longer ago was meant for another clock [s]
 
 
@@ -55,7 +59,10 @@ class StrikeTask:
         step = self.planner.step(now, position, velocity, contact)
         if contact is not None and not step.valid and contact.time > now:
             self._refusals.publish(self._message)
-        return step
+        if step.trajectory is None:
+            return step
+        # A controller refuses what has ended when it comes; the rest of a motion may be as short as that.
+        return dataclasses.replace(step, trajectory=extended(step.trajectory, now + _SHORTEST))
 
     def stamps(self) -> dict[str, float]:
         """When the last contact came."""

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.puck import SHIPPED as PUCK_MODEL
 from vpsto_ros.contact.puck import PuckModel
+from vpsto_ros.estimation.measurement import finite_array
 from vpsto_ros.estimation.puck_filter import PuckFilter, PuckFilterConfig, PuckState
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.planning.running_reference import MpcStep
@@ -196,12 +197,17 @@ class HockeyAgent:
         mallet, complaints = self.mpc.mallet(now, q, qd), []
         self.filter.observe_mallet(now, mallet[:2] - self._table, mallet[2:])
         for sighting in sightings:
-            place = np.asarray(sighting.position, dtype=float)[:2] - self._table
-            outcome = self.filter.update(sighting.time, place, sighting.covariance)
+            where, defect = finite_array(sighting.position, (2,))
+            if defect:
+                complaints.append(f"puck not used: position: {defect}")
+                continue
+            outcome = self.filter.update(sighting.time, where - self._table, sighting.covariance)
             if outcome.kind == "invalid":
                 complaints.append(f"puck not used: {outcome.reason}")
-            elif sighting.velocity is not None and outcome.kind != "stale":
-                self.filter.observe_velocity(sighting.velocity, sighting.velocity_covariance)
+            elif sighting.velocity is not None and outcome.kind in ("accepted", "reinitialized"):
+                moves = self.filter.observe_velocity(sighting.velocity, sighting.velocity_covariance)
+                if moves.kind == "invalid":
+                    complaints.append(f"velocity of the puck not used: {moves.reason}")
         return complaints
 
     def _puck(self, now: float) -> PuckState | None:

@@ -91,6 +91,7 @@ class PlayMotion:
         self.play, self.begin, self.end, self.start_time = play, begin, end, begin.time
         self._guess, self._last = guess, last
         self._bases: dict[int, OptimalBasis] = {}
+        self._priors: dict[int, GaussianPrior] = {}
 
     @property
     def timed(self) -> bool:
@@ -102,7 +103,7 @@ class PlayMotion:
         if n_via not in self._bases:
             basis = OptimalBasis.uniform(n_via)
             total = self.end.time - self.begin.time
-            if n_via and self.timed and self._last < total / (n_via + 1):
+            if n_via and self.timed and 0.0 < self._last < total / (n_via + 1):
                 late = 1.0 - self._last / total
                 basis = OptimalBasis(np.append(late * np.arange(1, n_via + 1) / n_via, 1.0))
             self._bases[n_via] = basis
@@ -151,11 +152,13 @@ class PlayMotion:
 
     def prior(self, n_via: int) -> GaussianPrior:
         """Smoothness prior, (4.15)."""
-        total = self.end.time - self.begin.time if self.timed else 1.0
-        return smoothness_prior(
-            self.basis(n_via), self.begin.position, self.begin.velocity, self.end.position, self.end.velocity,
-            total, spread=self.play.spread,
-        )  # fmt: skip
+        if n_via not in self._priors:
+            total = self.end.time - self.begin.time if self.timed else 1.0
+            self._priors[n_via] = smoothness_prior(
+                self.basis(n_via), self.begin.position, self.begin.velocity, self.end.position,
+                self.end.velocity, total, spread=self.play.spread,
+            )  # fmt: skip
+        return self._priors[n_via]
 
     def guesses(self, n_via: int) -> NDArray[np.float64]:
         """Straight to the guess and on from there, and the mean of the prior, (2, N, 7)."""

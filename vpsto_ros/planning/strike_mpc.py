@@ -55,9 +55,12 @@ class StrikeMpcConfig:
         0.1, "how far a joint may be from its reference before the arm counts as lost", unit="rad",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
+    slower: float = option(
+        0.1, "share by which the mallet may be slower at the touch than asked for", minimum=0.0, maximum=0.9
+    )
     tilt: MalletTilt = dataclasses.field(default_factory=MalletTilt)
     first_rounds: int = option(
-        3, "how often a new motion is planned with the swing of the mallet that the one before makes",
+        2, "how often a new motion is planned with the swing of the mallet that the one before makes",
         minimum=1, maximum=10,
     )  # fmt: skip
     approach: OnlineConfig = dataclasses.field(
@@ -72,7 +75,7 @@ class StrikeMpcConfig:
         )
     )
     first_iterations: int = option(
-        20, "iterations of a search that has nothing to start from", minimum=1, maximum=1000
+        8, "iterations of a search that has nothing to start from", minimum=1, maximum=1000
     )
 
     def __post_init__(self) -> None:
@@ -361,11 +364,14 @@ class StrikeMpc(ReferencePlanner):
             tilt = self.config.tilt
             begin, state = self._swing
             aside, rate = tilt.displacement(tilt.along(motion, contact.time, begin, state))
-        place = mallet[:2] + self.table.rules.table - aside
-        found = self.table.contact(cell, place, mallet[2:] - rate)
-        if found is None or (np.abs(found[1]) > self.play.limits.velocity).any():
-            raise InfeasibleError("the mallet cannot be that fast there")
-        return ArmState(contact.time, *found)
+        place, velocity = mallet[:2] + self.table.rules.table - aside, mallet[2:] - rate
+        found = self.table.contact(cell, place, velocity)
+        if found is None:
+            raise InfeasibleError("the touch is out of the arm's reach")
+        excess = float((np.abs(found[1]) / self.play.limits.velocity).max())
+        if excess > 1.0 + self.config.slower:
+            raise InfeasibleError(f"the mallet cannot be that fast there, but {1.0 / excess:.0%} of it")
+        return ArmState(contact.time, found[0], found[1] / max(1.0, excess))
 
     def _follow_through(self, target: ArmState) -> Trajectory:
         """On at the speed of the touch while it lasts, then home.
@@ -387,7 +393,13 @@ class StrikeMpc(ReferencePlanner):
         """
         end = ArmState(np.inf, self.home, np.zeros(7))
         rest = begin.position + 0.5 * self.table.config.brake * begin.velocity
-        result = self._plan(self._return, PlayMotion(self.play, begin, end, rest))
+        motion, before = PlayMotion(self.play, begin, end, rest), self._return.previous
+        if before is not None:
+            # While the touch moves by millimetres, the way home need not be searched again.
+            points = motion.shifted(before, self.config.home.n_via)
+            if motion.evaluate(points[None]).valid[0]:
+                return motion.trajectory(points)
+        result = self._plan(self._return, motion)
         if result.trajectory is None:
             raise InfeasibleError("no way home keeps limits and rules")
         self._return.accept(result.trajectory)

@@ -19,10 +19,12 @@ from vpsto_ros.robot.iiwa_kinematics import add_least_motion, chain, jacobian, m
 _SAMPLES = 9  # of a strike, at which places are checked
 _BAD = -1e9
 _DIFFERENCE = 0.01  # step of the difference that gives the curvature [s]
-_NEAR_ZERO = 1e-9
+_PARALLEL = 1e-7  # columns of the Jacobian whose cross product is less [m^2]
+_NO_PART = 1e-8  # of a joint in the dual, relative to its length [m]
 
 # Entries of the row of rules: the first six are those of PlayRules.kernel_row, the others of StrikeConfig.
-HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT, RUN_UP, HOLD, BRAKE, LEAD_WEIGHT = range(10)
+HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT = range(6)
+RUN_UP, HOLD, BRAKE, LEAD_WEIGHT, STEEPNESS = range(6, 11)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -40,54 +42,99 @@ def fastest(jac, ex, ey, limits, rates):
         rates: output (7,).
 
     Returns:
-        The speed [m/s], 0 if there is none.
+        The speed [m/s]; 0 if there is none, or if J is singular.
     """
-    best, first, second = np.inf, -1, -1
+    best = np.inf
     bx, by, bz = 0.0, 0.0, 0.0
     for i in range(6):
         for j in range(i):
             lx = jac[1, i] * jac[2, j] - jac[2, i] * jac[1, j]
             ly = jac[2, i] * jac[0, j] - jac[0, i] * jac[2, j]
             lz = jac[0, i] * jac[1, j] - jac[1, i] * jac[0, j]
-            along = lx * ex + ly * ey
-            if abs(along) < 1e-6 * math.sqrt(lx * lx + ly * ly + lz * lz) + _NEAR_ZERO:
+            along, norm = lx * ex + ly * ey, math.sqrt(lx * lx + ly * ly + lz * lz)
+            if norm < _PARALLEL or abs(along) < 1e-6 * norm:
                 continue
             lx, ly, lz = lx / along, ly / along, lz / along
             value = 0.0
             for k in range(6):
                 value += limits[k] * abs(jac[0, k] * lx + jac[1, k] * ly + jac[2, k] * lz)
             if value < best:
-                best, first, second, bx, by, bz = value, i, j, lx, ly, lz
-    if first < 0:
+                best, bx, by, bz = value, lx, ly, lz
+    if best == np.inf:
         return 0.0
-    return _primal(jac, ex, ey, limits, rates, best, first, second, bx, by, bz)
+    return _primal(jac, ex, ey, limits, rates, best, bx, by, bz)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _primal(jac, ex, ey, limits, rates, best, first, second, lx, ly, lz):
-    """Rates at the optimum: joints with a part in the dual at their limits, the pair makes up the rest."""
+def _primal(jac, ex, ey, limits, rates, best, lx, ly, lz):
+    """Rates at the optimum: joints with a part in the dual l at their limits, the others make up the rest.
+
+    Those are often three: the shoulder's have no part in the line from there to the universal joint, nor the
+    elbow's and the one after in theirs; more in symmetric postures.
+    """
     rx, ry, rz = best * ex, best * ey, 0.0
-    for k in range(7):
-        rates[k] = 0.0
+    zero = _NO_PART * math.sqrt(lx * lx + ly * ly + lz * lz)
+    free = np.zeros(6, dtype=np.bool_)
+    rates[6] = 0.0
     for k in range(6):
         part = jac[0, k] * lx + jac[1, k] * ly + jac[2, k] * lz
-        if k in (first, second) or abs(part) < _NEAR_ZERO:
+        free[k], rates[k] = abs(part) < zero, 0.0
+        if not free[k]:
+            rates[k] = math.copysign(limits[k], part)
+            rx, ry, rz = rx - jac[0, k] * rates[k], ry - jac[1, k] * rates[k], rz - jac[2, k] * rates[k]
+    _make_up(jac, free, rx, ry, rz, lx, ly, lz, limits, rates)
+    worst = 0.0
+    ox, oy, oz = best * ex, best * ey, 0.0
+    for k in range(6):
+        worst = max(worst, abs(rates[k]) / limits[k])
+        ox, oy, oz = ox - jac[0, k] * rates[k], oy - jac[1, k] * rates[k], oz - jac[2, k] * rates[k]
+    return best if worst < 1.0 + 1e-6 and abs(ox) + abs(oy) + abs(oz) < 1e-6 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _make_up(jac, free, rx, ry, rz, lx, ly, lz, limits, rates):
+    """The rest (rx, ry, rz) by the free joints, in the plane across l, at the least share of their limits.
+
+    The same problem as in :func:`fastest` in two dimensions, along u = r / |r| and w across it: the dual is
+    (1, m) and its minimum is where a joint has no part in it.
+    """
+    size, norm = math.sqrt(rx * rx + ry * ry + rz * rz), math.sqrt(lx * lx + ly * ly + lz * lz)
+    if size < 1e-12:
+        return
+    ux, uy, uz = rx / size, ry / size, rz / size
+    wx, wy, wz = (ly * uz - lz * uy) / norm, (lz * ux - lx * uz) / norm, (lx * uy - ly * ux) / norm
+    along, across = np.zeros(6), np.zeros(6)
+    for k in range(6):
+        if free[k]:
+            along[k] = jac[0, k] * ux + jac[1, k] * uy + jac[2, k] * uz
+            across[k] = jac[0, k] * wx + jac[1, k] * wy + jac[2, k] * wz
+    best, slope = np.inf, 0.0
+    for i in range(7):
+        m = 0.0  # the last one: nothing across
+        if i < 6:
+            if abs(across[i]) < _PARALLEL:
+                continue
+            m = -along[i] / across[i]
+        value = 0.0
+        for k in range(6):
+            value += limits[k] * abs(along[k] + m * across[k])
+        if value < best:
+            best, slope = value, m
+    if best < 1e-12:
+        return
+    rest, reach, zero = 0.0, 0.0, _NO_PART * math.hypot(1.0, slope)
+    for k in range(6):
+        if not free[k]:
             continue
-        rates[k] = math.copysign(limits[k], part)
-        rx, ry, rz = rx - jac[0, k] * rates[k], ry - jac[1, k] * rates[k], rz - jac[2, k] * rates[k]
-    a = jac[0, first] ** 2 + jac[1, first] ** 2 + jac[2, first] ** 2
-    b = jac[0, first] * jac[0, second] + jac[1, first] * jac[1, second] + jac[2, first] * jac[2, second]
-    d = jac[0, second] ** 2 + jac[1, second] ** 2 + jac[2, second] ** 2
-    g = jac[0, first] * rx + jac[1, first] * ry + jac[2, first] * rz
-    h = jac[0, second] * rx + jac[1, second] * ry + jac[2, second] * rz
-    det = a * d - b * b
-    rates[first], rates[second] = (d * g - b * h) / det, (a * h - b * g) / det
-    worst = max(abs(rates[first]) / limits[first], abs(rates[second]) / limits[second])
-    off = abs(rx - jac[0, first] * rates[first] - jac[0, second] * rates[second])
-    off += abs(ry - jac[1, first] * rates[first] - jac[1, second] * rates[second])
-    off += abs(rz - jac[2, first] * rates[first] - jac[2, second] * rates[second])
-    # Where joints do the same (their planes coincide) the pair may not do: such a posture is passed over.
-    return best if worst < 1.0 + 1e-6 and off < 1e-6 else 0.0  # also where numbers are not finite
+        part = along[k] + slope * across[k]
+        if abs(part) < zero:
+            reach += limits[k] * abs(across[k])
+        else:
+            rates[k] = math.copysign(limits[k], part) * size / best
+            rest -= across[k] * rates[k]
+    for k in range(6):
+        if free[k] and reach > 0.0 and abs(along[k] + slope * across[k]) < zero:
+            rates[k] = math.copysign(limits[k], across[k]) * rest / reach
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -108,7 +155,11 @@ def straighten(q, rates, jac, curvature, probe, points, axes, other):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _overspeed(rates, curvature, limits, rules):
-    """Largest share of the velocity limits on the way, at least 1."""
+    """Largest share of the limits of velocity and acceleration on the way, at least 1.
+
+    Those of acceleration are the STEEPNESS of the rules [1/s] times those of velocity. Accelerations are
+    linear in s while the joints accelerate and while they brake, so that the ends count.
+    """
     begin, hold, end = -0.5 * rules[RUN_UP], rules[HOLD], rules[HOLD] + 0.5 * rules[BRAKE]
     worst = 1.0
     for i in range(_SAMPLES):
@@ -121,6 +172,12 @@ def _overspeed(rates, curvature, limits, rules):
             pace = math.sqrt(max(0.0, 1.0 - (s - hold) / (end - hold)))
         for k in range(6):
             worst = max(worst, pace * abs(rates[k] + curvature[k] * s) / limits[k])
+    for k in range(6):
+        rise, fall, bend = 1.0 / rules[RUN_UP], 1.0 / rules[BRAKE], curvature[k]
+        steepest = max(abs(rise * (rates[k] + begin * bend)), abs(rise * rates[k] + bend))
+        steepest = max(steepest, abs(fall * (rates[k] + hold * bend) - bend))
+        steepest = max(steepest, abs(fall * (rates[k] + end * bend)))
+        worst = max(worst, steepest / (limits[k] * rules[STEEPNESS]))
     return worst
 
 

@@ -12,6 +12,8 @@ import itertools
 import json
 import math
 import pathlib
+import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
@@ -260,26 +262,28 @@ class StrikeTable:
         Raises:
             ConfigurationError: there is no such file, it is of another format, or its numbers are no table.
         """
+        remedy = "`vpsto learn strikes` makes one"
         try:
-            with np.load(path, allow_pickle=False) as content:
+            content = np.load(path, allow_pickle=False)
+            if not isinstance(content, np.lib.npyio.NpzFile):
+                raise ValueError("it holds a single array")
+            with content:
                 about = json.loads(str(content["about"]))
                 arrays = {name: content[name] for name in ("x", "y", "angle", "speed", "posture", "rates")}
         except FileNotFoundError:
-            raise ConfigurationError(
-                f"there is no table of strikes {path}; `vpsto learn strikes` makes one"
-            ) from None
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise ConfigurationError(f"{path} is not a table of strikes: {error}") from None
+            raise ConfigurationError(f"there is no table of strikes {path}; {remedy}") from None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise ConfigurationError(f"{path} is not a table of strikes: {error}; {remedy}") from None
         if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise ConfigurationError(f"{path} is not of the format '{FORMAT}'")
+            raise ConfigurationError(f"{path} is not of the format '{FORMAT}'; {remedy}")
         try:
             rules = {**about["rules"], "home": tuple(about["rules"]["home"])}
             distance = float(about["contact_distance"])
             settings = {**about["config"], "lead_weights": tuple(about["config"]["lead_weights"])}
             config = StrikeConfig(**settings)
             return cls(**arrays, contact_distance=distance, config=config, rules=PlayRules(**rules))
-        except (KeyError, TypeError, InvalidInputError, ConfigurationError) as error:
-            raise ConfigurationError(f"{path} is not a table of strikes: {error}") from None
+        except (KeyError, TypeError, ValueError, InvalidInputError, ConfigurationError) as error:
+            raise ConfigurationError(f"{path} is not a table of strikes: {error}; {remedy}") from None
 
 
 def tabulate(
@@ -341,8 +345,9 @@ class _Search:
         self._home = np.array(rules.home)
         self._velocity = config.speed_share * limits.velocity
         self._positions = 0.99 * limits.position_range[1]
+        steepness = (limits.acceleration / self._velocity).min()
         self._row = np.array(
-            [*rules.kernel_row(), config.run_up, config.hold, config.brake, lead_weight]
+            [*rules.kernel_row(), config.run_up, config.hold, config.brake, lead_weight, steepness]
         )
         # A strike as it is searched is nearer to the plane than what is allowed: replanning needs the rest.
         self._row[1] *= 0.4

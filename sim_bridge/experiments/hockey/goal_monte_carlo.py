@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.hockey.goal_shots import ANGLES, LATEST, LONGEST
+from sim_bridge.experiments.hockey.goal_shots import ANGLES, LATEST, LONGEST, SPREAD
 from sim_bridge.hockey.recordings import TABLE
 from vpsto_ros.contact.puck import PuckModel
 
@@ -18,8 +18,6 @@ SHOTS = 40
 """Of each number of banks."""
 SAMPLES = 4000
 """Trajectories per shot; also N_G of (5.11)."""
-SPREAD = np.diag([1e-3, 1e-3, 0.01, 0.01]) ** 2
-"""What is not known of the puck before the hit."""
 
 _SOME = (0.1, 0.9)  # probabilities that are compared; at both ends any model agrees
 

@@ -2,8 +2,9 @@
 
 The model aims, so that goals of every probability occur by way of no wall and of some: of a fan of shooting
 angles, the one is struck whose probability is nearest to one that is drawn. The arm strikes as well as it
-can; the mallet swings, so that the touch is another than was meant. What counts is predicted from the true
-states at the touch. Table frame.
+can; the mallet swings, so that the touch is another than was meant. What counts is predicted twice: from the
+true states at the touch, and from such as a planner has, off by an error whose covariance is known. Table
+frame.
 """
 
 import dataclasses
@@ -26,7 +27,10 @@ LATEST = 3.0
 ANGLES = np.linspace(-1.25, 1.25, 251)
 """Shooting angles among which the model chooses [rad]."""
 
-_BEST = 1.2  # probabilities are drawn up to this: a sixth of the shots are the safest ones
+SPREAD = np.diag([1e-3, 1e-3, 0.01, 0.01]) ** 2
+"""What a planner does not know of the puck beside the mallet at their touch: 1 mm and 10 mm/s."""
+
+_WANTED = (0.1, 1.05)  # probabilities that are aimed at; safer and less safe shots come by themselves
 _SLOWEST = 0.02  # slower pucks have stopped [m/s]
 _TICK = 0.01  # between two looks at the puck [s]
 
@@ -38,8 +42,10 @@ class Shot:
     Attributes:
         puck: true state of the puck when the mallet touched it, shape (4,) [m, m/s].
         mallet: and of the mallet's centre, shape (4,).
-        predicted: probability of a goal.
-        banks: walls that the model expects on the way.
+        predicted: probability of a goal, from a state that is off by an error of covariance SPREAD.
+        banks: walls that the model then expects on the way.
+        predicted_truly: probability from the true state.
+        banks_truly: and walls.
         scored: whether the puck went into the far goal when it first came there.
     """
 
@@ -47,6 +53,8 @@ class Shot:
     mallet: NDArray[np.float64]
     predicted: float
     banks: int
+    predicted_truly: float
+    banks_truly: int
     scored: bool
 
 
@@ -67,16 +75,20 @@ def shoot(world: AirHockeyWorld, model: PuckModel, rng: np.random.Generator) -> 
     if len(hits) != 1 or world.limits.violations > before:
         return None
     puck, mallet = states_at(hits[0])
-    outlook = model.shots(puck, np.zeros((4, 4)), mallet[None], longest=LONGEST)
-    scored = world.goal is not None and world.goal.end == "far"
-    return Shot(puck, mallet, float(outlook.goal[0]), int(outlook.banks[0]), scored)
+    seen = rng.multivariate_normal(puck, SPREAD)
+    expected = model.shots(seen, SPREAD, mallet[None], longest=LONGEST)
+    truly = model.shots(puck, np.zeros((4, 4)), mallet[None], longest=LONGEST)
+    return Shot(
+        puck, mallet, float(expected.goal[0]), int(expected.banks[0]), float(truly.goal[0]),
+        int(truly.banks[0]), world.goal is not None and world.goal.end == "far",
+    )  # fmt: skip
 
 
 def aim(model: PuckModel, rng: np.random.Generator) -> Strike | None:
     """A strike, half of them direct, half by way of walls; None if there is no such way from there."""
     place, speed = rng.uniform((-0.65, -0.35), (-0.2, 0.35)), rng.uniform(0.6, 1.4)
     velocity, length, phase = rng.normal(0.0, 0.1, 2), rng.uniform(0.2, 0.35), rng.uniform(0.4, 0.6)
-    direct, wanted = bool(rng.random() < 0.5), rng.uniform(0.0, _BEST)
+    direct, wanted = bool(rng.random() < 0.5), rng.uniform(*_WANTED)
     outlook = fan(model, np.append(place, velocity), speed)
     # The angle that is taken is one of those nearest to what is wanted, not always the same side's.
     fits = np.flatnonzero((outlook.time <= LATEST) & ((outlook.banks == 0) == direct))
@@ -91,7 +103,7 @@ def fan(model: PuckModel, puck: NDArray, speed: float) -> ShotOutlook:
     """Outlooks of central shots at all angles with one speed [m/s]."""
     directions = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     mallets = np.hstack([puck[:2] - TABLE.contact_distance * directions, speed * directions])
-    return model.shots(puck, np.zeros((4, 4)), mallets, longest=LONGEST)
+    return model.shots(puck, SPREAD, mallets, longest=LONGEST)
 
 
 def states_at(contact: PuckContact) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

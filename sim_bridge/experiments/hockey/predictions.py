@@ -1,6 +1,7 @@
 """Predicting pucks of recorded episodes from true states, and where they really went."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,15 @@ _DENT = 3e-3  # how deep pucks may push into a rim [m]
 _LEAD = 1  # whole steps from the start of a prediction to the bounce
 
 
+Way = tuple[float, NDArray[np.float64], NDArray[np.float64]]
+"""Weight, mean and covariance of a Gaussian in a mixture."""
+_DRAWN = 4000  # samples of a mixture
+_LEAST_WEIGHT = 0.01  # of a way that is followed on its own
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prediction:
-    """A Gaussian for where a puck is after a horizon, and where it was; table frame.
+    """Gaussians for where a puck is after a horizon, and where it was; table frame.
 
     Attributes:
         kind: one of KINDS.
@@ -30,6 +37,8 @@ class Prediction:
         mean: expected place, shape (2,) [m].
         covariance: of the place, shape (2, 2) [m²].
         truth: shape (2,) [m].
+        ways: (weight, mean, covariance) of the mixture that these are of, one for each way of bouncing; none:
+            it is this one Gaussian.
     """
 
     kind: str
@@ -38,6 +47,7 @@ class Prediction:
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
     truth: NDArray[np.float64]
+    ways: tuple[Way, ...] = ()
 
     @property
     def error(self) -> float:
@@ -46,9 +56,24 @@ class Prediction:
 
     @property
     def distance(self) -> float:
-        """Squared Mahalanobis distance, which decides about ellipses."""
-        off = self.truth - self.mean
-        return float(off @ np.linalg.solve(self.covariance, off))
+        """Squared Mahalanobis distance, which decides about ellipses.
+
+        Of a mixture, the one that has as much of a Gaussian's mass nearer as the mixture has where it is
+        denser: what is the ellipse of a probability for a Gaussian is for it the densest region.
+        """
+        if len(self.ways) < 2:
+            off = self.truth - self.mean
+            return float(off @ np.linalg.solve(self.covariance, off))
+        rng = np.random.default_rng(0)
+        weights = np.array([weight for weight, _, _ in self.ways])
+        counts = np.maximum(np.round(_DRAWN * weights).astype(int), 1)
+        drawn = [
+            rng.multivariate_normal(mean, covariance, count)
+            for (_, mean, covariance), count in zip(self.ways, counts, strict=True)
+        ]
+        denser = _density(self.ways, np.vstack(drawn)) > _density(self.ways, self.truth[None])[0]
+        share = min(float(np.repeat(weights / counts, counts) @ denser), 1.0 - 0.5 / _DRAWN)
+        return -2.0 * float(np.log1p(-share))
 
 
 def predictions(episode: Episode, model: PuckModel) -> list[Prediction]:
@@ -78,10 +103,9 @@ def _from_sample(
     puck = episode.recording.puck
     if sample < 0 or not _seen(episode, end) or MALLET in met or bool(met) != (kind == "wall"):
         return None
-    mean, covariance = puck[sample].copy(), np.zeros((4, 4))
-    for _ in range(end - sample):
-        mean, covariance = model.step(mean, covariance)
-    return Prediction(kind, horizon, puck[sample, :2], mean[:2], covariance[:2, :2], puck[end, :2])
+    start = (1.0, puck[sample].copy(), np.zeros((4, 4)))
+    ways = rolled(model, start, [model.period] * (end - sample))
+    return Prediction(kind, horizon, puck[sample, :2], *merged(ways), puck[end, :2], ways)
 
 
 def _from_touch(
@@ -98,13 +122,43 @@ def _from_touch(
     start = np.array([*table.to_table(contact.pose[:2]), *contact.velocity_before[:2]])
     mallet = np.array([*table.to_table(contact.mallet.position[:2]), *contact.mallet.velocity[:2]])
     means, covariances = model.hit(start[None], mallet[None])
-    mean, covariance = model.step(means[0], covariances[0], first * model.period - time)
-    for _ in range(end - first):
-        mean, covariance = model.step(mean, covariance)
+    durations = [first * model.period - time] + [model.period] * (end - first)
+    ways = rolled(model, (1.0, means[0], covariances[0]), durations)
     truth = episode.recording.puck[end, :2]
-    return Prediction(
-        "hit_wall" if met else "hit", horizon, start[:2], mean[:2], covariance[:2, :2], truth
-    )
+    return Prediction("hit_wall" if met else "hit", horizon, start[:2], *merged(ways), truth, ways)
+
+
+def rolled(model: PuckModel, start: Way, durations: Sequence[float]) -> tuple[Way, ...]:
+    """Ways (weight, place, covariance of the place) after steps, from a state and its covariance."""
+    ways = [start]
+    for duration in durations:
+        after: list[Way] = []
+        for weight, mean, covariance in ways:
+            parts = model.split_step(mean, covariance, duration)
+            if len(parts) > 1 and weight * min(share for share, _, _ in parts) < _LEAST_WEIGHT:
+                parts = [(1.0, *model.step(mean, covariance, duration))]
+            after += [(weight * share, state, spread) for share, state, spread in parts]
+        ways = after
+    return tuple((weight, mean[:2], covariance[:2, :2]) for weight, mean, covariance in ways)
+
+
+def merged(ways: Sequence[Way]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and covariance of a mixture."""
+    mean = np.sum([weight * way for weight, way, _ in ways], axis=0)
+    spreads = [
+        weight * (covariance + np.outer(way - mean, way - mean)) for weight, way, covariance in ways
+    ]
+    return mean, np.sum(spreads, axis=0)
+
+
+def _density(ways: Sequence[Way], places: NDArray) -> NDArray[np.float64]:
+    """Of a mixture at places (N, 2)."""
+    total = np.zeros(len(places))
+    for weight, mean, covariance in ways:
+        off = places - mean
+        squared = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off)
+        total += weight * np.exp(-0.5 * squared) / np.sqrt(np.linalg.det(covariance))
+    return total
 
 
 def _met(episode: Episode, begin: float, end: float, apart_from: PuckContact | None = None) -> set[str]:

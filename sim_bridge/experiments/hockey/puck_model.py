@@ -41,6 +41,8 @@ COVERAGE = {50: (0.45, 0.85), 90: (0.85, 0.97), 99: (0.97, 1.0)}
 """Shares of the true places that ellipses must hold, from and to."""
 LEAST = 0.80
 """Of each kind of prediction with a contact, in the ellipse of 90 %."""
+ENOUGH = 20
+"""Predictions of a kind, below which its share says nothing."""
 FLOATING_ERROR = 1e-3
 """Allowed of a floating puck over the longest horizon [m]."""
 _STREAM = 2  # no episode that a model is learned from, whatever the seed
@@ -118,7 +120,7 @@ def summarise(found: Sequence[Prediction]) -> dict[str, Any]:
         }
     met = [p for p in found if p.kind != "floating"]
     floating = [p.error for p in found if p.kind == "floating"]
-    shares = [kinds[kind]["coverage_90"] for kind in KINDS[1:] if kinds[kind]["predictions"]]
+    shares = [kinds[kind]["coverage_90"] for kind in KINDS[1:] if kinds[kind]["predictions"] >= ENOUGH]
     return {
         **statistics(met),
         "least_coverage_90": min(shares, default=0.0),
