@@ -30,7 +30,7 @@ def summarise(found: Sequence[ShotResult]) -> dict[str, Any]:
         "constraint_violations": sum(row["violations"] for row in rows.values()),
         "violations_by_kind": dict(_violations(found)),
         **_times([shot for shot in found if shot.task.name not in BASELINES] or found),
-        "step_time": "processor time of the agent's steps, all of them, without garbage collection; "
+        "step_time": "processor time of the agent's steps, all of them, with gc.freeze() before each shot; "
         "step_wall_ms_*: by the clock, which what else runs on the machine adds to",
     }  # fmt: skip
 

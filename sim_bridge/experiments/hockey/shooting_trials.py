@@ -94,7 +94,10 @@ class ShotResult:
 
 
 def trial(task: ShotTask) -> ShotResult:
-    """A shot in a fresh world by a fresh player; no garbage is collected meanwhile, as in real time."""
+    """A shot in a fresh world by a fresh player.
+
+    What is there before it is kept from the garbage collector, as programs in real time do.
+    """
     world, agent = world_of(task), player(task.name, task.seed)
     gc.collect()
     gc.freeze()
