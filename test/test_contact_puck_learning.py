@@ -126,9 +126,11 @@ def test_what_made_the_recordings_is_learned():
         ours, true = getattr(model, name), getattr(TRUTH, name)
         np.testing.assert_allclose(ours.matrix, true.matrix, atol=atol, err_msg=name)
         np.testing.assert_allclose(ours.offset, true.offset, atol=atol, err_msg=name)
-        np.testing.assert_allclose(
-            np.sqrt(np.diag(ours.covariance)), np.sqrt(np.diag(true.covariance)), rtol=0.15, err_msg=name
-        )
+        # Of what they are at a usual speed: how much they grow with it is not told well by so few.
+        usual = {"floating": [1.0, 0.5], "wall": [-0.8, 0.5], "mallet": [0.0, 0.0, 0.9, 0.2]}[name]
+        scatter = np.sqrt(np.diag(ours.covariance) * ours.scales(usual))
+        np.testing.assert_allclose(scatter, np.sqrt(np.diag(true.covariance)), rtol=0.15, err_msg=name)
+    assert model.lively is None, "there is one kind of bounces"
 
 
 def test_fresh_recordings_lie_within_the_ellipses_that_are_predicted():

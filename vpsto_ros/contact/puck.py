@@ -7,19 +7,17 @@ its centre, x towards the goal that is shot at.
 
 import dataclasses
 import functools
-import json
 import pathlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.contact import puck_modes, puck_rollout
+from vpsto_ros.contact import puck_file, puck_modes, puck_rollout
 from vpsto_ros.contact.hockey_table import HockeyTable
 from vpsto_ros.contact.linear_gaussian import LinearGaussian
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 
-FORMAT = "vpsto_ros puck model 2"
 SHIPPED = pathlib.Path(__file__).parent / "models" / "puck.json"
 """The model of the simulated world, which comes with the package; its origin is in the file."""
 MODES = ("floating", "wall", "mallet")
@@ -322,14 +320,7 @@ class PuckModel:
             path: of the file.
             origin: where the model comes from (command, seed, figures), for people.
         """
-        content = {
-            "format": FORMAT, "origin": origin, "period": self.period,
-            "hit_delay": self.hit_delay, "table": dataclasses.asdict(self.table),
-            **{name: getattr(self, name).as_dict() for name in MODES},
-        }  # fmt: skip
-        if self.lively is not None:
-            content |= {"lively_share": self.lively_share, "lively": self.lively.as_dict()}
-        pathlib.Path(path).write_text(json.dumps(content, indent=1) + "\n")
+        puck_file.write(self, path, origin)
 
     @classmethod
     def load(cls, path: str | pathlib.Path) -> "PuckModel":
@@ -339,24 +330,8 @@ class PuckModel:
             ConfigurationError: there is no such file, it is of another format, or its numbers are no model.
         """
         try:
-            content = json.loads(pathlib.Path(path).read_text())
-        except FileNotFoundError:
-            raise ConfigurationError(
-                f"there is no puck model {path}; `vpsto learn puck_model` makes one"
-            ) from None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ConfigurationError(f"{path} is not a puck model: {error}") from None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ConfigurationError(
-                f"{path} is not of the format '{FORMAT}'; `vpsto learn puck_model` makes one that is"
-            )
-        try:
-            names = (*MODES, "lively") if "lively" in content else MODES
-            modes = {name: LinearGaussian(**content[name]) for name in names}
-            table, delay = HockeyTable(**content["table"]), float(content.get("hit_delay", 0.0))
-            share = float(content.get("lively_share", 0.0))
-            return cls(table, float(content["period"]), **modes, hit_delay=delay, lively_share=share)
-        except (KeyError, TypeError, ValueError, InvalidInputError, ConfigurationError) as error:
+            return cls(**puck_file.read(path))
+        except InvalidInputError as error:
             raise ConfigurationError(f"{path} is not a puck model: {error}") from None
 
     def _states(self, mean: ArrayLike, covariance: ArrayLike) -> tuple[NDArray, NDArray]:
