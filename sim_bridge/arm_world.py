@@ -74,7 +74,7 @@ class ArmWorld(abc.ABC):
         self.limits.observe(q_des, qd_des, qdd_des, self._q, self._qd, controller.demand)
         self._act(now)
         if now >= self.camera.next_capture:
-            self.camera.capture(now, self.object_pose())
+            self.camera.capture(now, self.object_pose(), visible=self.object_visible)
         mujoco.mj_step2(self.model, self.data)
         self._steps += 1
 
@@ -101,6 +101,11 @@ class ArmWorld(abc.ABC):
     def camera_frames(self) -> list[CameraFrame]:
         """What the camera has delivered since the last call."""
         return self.camera.poll(self.time)
+
+    @property
+    def object_visible(self) -> bool:
+        """Whether the object is where the camera looks."""
+        return True
 
     @abc.abstractmethod
     def _act(self, now: float) -> None:

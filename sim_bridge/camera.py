@@ -66,8 +66,13 @@ class Camera:
         """When the next picture is due [s]."""
         return self._start + self._index / self.config.rate - _ROUNDING
 
-    def capture(self, t: float, pose: ArrayLike) -> bool:
+    def capture(self, t: float, pose: ArrayLike, *, visible: bool = True) -> bool:
         """Take a picture of the true pose (x, y, yaw) at time t [s] if one is due; says whether one was.
+
+        Args:
+            t: time.
+            pose: of the object, shape (3,).
+            visible: whether it is in the picture; else there is no result.
 
         Raises:
             InvalidInputError: the pose has another shape.
@@ -82,7 +87,7 @@ class Camera:
         # Noise and drop-outs are drawn for every picture, so that runs which differ in one of them stay
         # comparable.
         noise, lost = self._rng.standard_normal(3), self._rng.random() < self.config.dropout
-        if not lost:
+        if visible and not lost:
             measured = pose + self._stds * noise
             measured[2] = np.pi - (np.pi - measured[2]) % (2.0 * np.pi)
             self._pending.append(CameraFrame(float(t), measured, self._covariance))

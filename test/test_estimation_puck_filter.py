@@ -368,3 +368,97 @@ def test_nothing_from_outside_raises_or_leaves_numbers_that_are_none(seed):
         assert estimator.status(stamp).kind
         if state is not None:
             assert np.isfinite(state.mean).all() and positive_definite(state.covariance)
+
+
+# Measured velocities.
+
+
+def observed(covariance=None):
+    """A filter that has seen a puck move at (0.4, -0.2) m/s four times, and its state."""
+    estimator = PuckFilter(model())
+    for k in range(4):
+        estimator.update(FRAME * k, np.array([0.1 + 0.4 * FRAME * k, 0.2 - 0.2 * FRAME * k]), covariance)
+    return estimator, estimator.state(3 * FRAME)
+
+
+def test_a_measured_velocity_is_a_linear_gaussian_observation():
+    """Against the information form: precisions add up."""
+    estimator, before = observed()
+    measured, noise = np.array([0.45, -0.15]), np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+    assert estimator.observe_velocity(measured, noise) == "accepted"
+    after = estimator.state(3 * FRAME)
+    pick = np.hstack([np.zeros((2, 2)), np.eye(2)])
+    precision = np.linalg.inv(before.covariance) + pick.T @ np.linalg.inv(noise) @ pick
+    mean = np.linalg.solve(
+        precision, np.linalg.solve(before.covariance, before.mean) + pick.T @ np.linalg.solve(noise, measured)
+    )
+    np.testing.assert_allclose(after.covariance, np.linalg.inv(precision), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(after.mean, mean, rtol=1e-6, atol=1e-9)
+    assert positive_definite(after.covariance)
+
+
+def test_the_noise_of_the_options_is_used_where_none_comes_along():
+    with_default, _ = observed()
+    with_same, _ = observed()
+    std = with_default.config.velocity_std
+    with_default.observe_velocity([0.4, -0.2])
+    with_same.observe_velocity([0.4, -0.2], std**2 * np.eye(2))
+    first, second = (each.state(3 * FRAME) for each in (with_default, with_same))
+    np.testing.assert_array_equal(first.mean, second.mean)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_a_first_position_with_its_velocity_is_all_that_is_needed():
+    estimator = PuckFilter(model())
+    assert estimator.observe_velocity([1.0, 0.0]) == "stale"
+    estimator.update(0.0, [0.1, 0.2])
+    assert estimator.observe_velocity([0.4, -0.2], 1e-6 * np.eye(2)) == "accepted"
+    np.testing.assert_allclose(estimator.state(0.0).mean, [0.1, 0.2, 0.4, -0.2], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "covariance"),
+    [
+        ([math.nan, 0.0], None),
+        ([1.0], None),
+        ("fast", None),
+        (None, None),
+        ([0.0, 0.0], -np.eye(2)),
+        ([0.0, 0.0], np.zeros((2, 2))),
+        ([0.0, 0.0], 1.0),
+        ([0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]]),
+    ],
+)
+def test_a_velocity_that_is_none_changes_nothing(velocity, covariance):
+    estimator, before = observed()
+    outcome = estimator.observe_velocity(velocity, covariance)
+    assert outcome.kind == "invalid" and ("velocity" in outcome.reason or "covariance" in outcome.reason)
+    after = estimator.state(3 * FRAME)
+    np.testing.assert_array_equal(after.mean, before.mean)
+    np.testing.assert_array_equal(after.covariance, before.covariance)
+
+
+def test_an_unlikely_velocity_is_an_outlier():
+    estimator, _ = observed(1e-8 * np.eye(2))
+    for _ in range(3):  # it settles
+        estimator.observe_velocity([0.4, -0.2], 1e-4 * np.eye(2))
+    before = estimator.state(3 * FRAME)
+    outcome = estimator.observe_velocity([3.0, 2.0], 1e-4 * np.eye(2))
+    assert outcome.kind == "outlier" and "Mahalanobis" in outcome.reason
+    np.testing.assert_array_equal(estimator.state(3 * FRAME).mean, before.mean)
+
+
+def test_while_a_contact_lasts_no_velocity_counts():
+    """It is the one before or the one after, and nobody knows which."""
+    estimator = PuckFilter(model(), PuckFilterConfig(wall_contact=(0.05, 1e-4)))
+    y, stamp = 0.3, 0.0
+    while y < TABLE.reach[1]:
+        estimator.update(stamp, [0.2, y])
+        assert estimator.observe_velocity([0.0, 1.5]) == "accepted"
+        stamp, y = stamp + FRAME, y + 1.5 * FRAME
+    assert estimator.update(stamp, [0.2, TABLE.reach[1]]) == "accepted"
+    before = estimator.state(stamp)
+    assert before.touching == "wall"
+    outcome = estimator.observe_velocity([0.0, 1.5])
+    assert outcome.kind == "outlier" and "contact" in outcome.reason
+    np.testing.assert_array_equal(estimator.state(stamp).mean, before.mean)

@@ -134,7 +134,7 @@ def test_the_library_needs_neither_ros_nor_a_simulator():
     loaded = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.split()
-    assert "vpsto_ros.trajectory" in loaded
+    assert {"vpsto_ros.trajectory", "vpsto_ros.planning.hockey_agent"} <= set(loaded)
     tops = {name.split(".")[0] for name in loaded}
     assert tops.isdisjoint(HEAVY)
 
@@ -156,6 +156,8 @@ def test_models_are_installed_with_the_package():
     assert files
     assert {str(file.parent) for file in files} == {"vpsto_ros/robot/models"}
     assert '"vpsto_ros.robot": ["models/*.xml"]' in SETUP
+    for file in ROOT.glob("vpsto_ros/*/models/*"):
+        assert f'"vpsto_ros.{file.parts[-3]}": ["models/*{file.suffix}"]' in SETUP, file
 
 
 def test_options_explain_themselves_in_help():

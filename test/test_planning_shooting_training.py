@@ -75,14 +75,28 @@ def test_the_first_angle_of_an_example_is_the_best(setting):
     finder, config = search(setting), TrainingConfig(states=60, actions=40)
     data = examples(finder, config, np.random.default_rng(1000))
     assert data.angles.shape == (len(data.states), 40) and 50 < len(data.states) <= 60
-    scores = score(finder, data.states, data.angles, config.covariance)
+    reserved = dataclasses.replace(SETTINGS[setting], beta=0.6)
+    scores = score(finder, data.states, data.angles, config.covariance, reserved)
     np.testing.assert_array_equal(scores.argmax(axis=1), 0)
-    np.testing.assert_array_equal(data.allowed, scores[:, 0] > -1.0)
+    scores = score(finder, data.states, data.angles, config.covariance)
+    np.testing.assert_array_equal(data.allowed, scores[:, 0] > 0.0)
     assert data.allowed.mean() > 0.7 and np.abs(data.angles).max() <= finder.strikes.angle[-1]
     # Each score is that of direct search for this angle, never more than its best.
     for row in range(5):
         best = finder.best(0.0, data.states[row], config.covariance)
         assert scores[row, 0] <= best.value + 0.02
+
+
+def test_examples_keep_a_reserve_where_there_is_one():
+    finder, goals = search("aggressive"), []
+    certain = ShotSearch(MODEL, StandInStrikes(), ShootingConfig(objective=SETTINGS["conservative"]))
+    for reserve in (0.0, 0.1, 0.2):
+        config = TrainingConfig(states=80, actions=60, reserve=reserve)
+        data = examples(finder, config, np.random.default_rng(1000))
+        chances = score(certain, data.states, data.angles[:, :1], config.covariance)[:, 0]
+        goals.append(np.median(chances))
+        assert (chances > 0.5 + reserve).mean() > 0.8
+    assert goals[0] < goals[1] < goals[2]
 
 
 def test_states_without_a_good_angle_give_the_likeliest():

@@ -466,3 +466,12 @@ def test_a_puck_cannot_be_put_under_the_mallet_where_that_is_now(shared):
         with pytest.raises(InvalidInputError, match=message):
             shared.place_puck(place)
     np.testing.assert_allclose(shared.puck_pose(), [1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_the_camera_sees_a_puck_in_a_goal_but_not_one_that_is_gone():
+    world = AirHockeyWorld(camera=CameraConfig(rate=100.0, latency=0.0, position_std=0.0, dropout=0.0))
+    world.reset(in_base(0.8, 0.0), (2.0, 0.0, 0.0))
+    world.advance(0.4)
+    seen = [frame.pose[0] - table.TABLE_ORIGIN[0] for frame in world.camera_frames()]
+    assert table.HALF_LENGTH < max(seen) <= table.HALF_LENGTH + 0.1
+    assert world.goal.end == "far" and world.object_pose()[0] > max(seen) + table.TABLE_ORIGIN[0]

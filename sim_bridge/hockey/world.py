@@ -28,6 +28,9 @@ CAMERA = CameraConfig(rate=120.0, latency=0.01, position_std=5e-7**0.5, yaw_std=
 """A camera as above real tables: 120 Hz, position variance 5e-7 m²."""
 
 
+_BEHIND_GOALS = 0.1  # so far beyond the rims the camera sees [m]
+
+
 @documented
 @dataclass(frozen=True)
 class ArmGains:
@@ -166,6 +169,11 @@ class AirHockeyWorld(ArmWorld):
     def height_deviation(self) -> float:
         """Largest distance of the universal joint from the height of play since the last reset [m]."""
         return self.rules.report().height.worst
+
+    @property
+    def object_visible(self) -> bool:
+        """Whether the puck is on the table or in a goal; the camera sees nothing of one that is gone."""
+        return table.on_table(self.puck_pose()[:2], -_BEHIND_GOALS)
 
     def mallet_state(self) -> MalletState:
         """The mallet now."""

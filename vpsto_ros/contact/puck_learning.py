@@ -177,17 +177,18 @@ def fit(steps: LabelledSteps, table: HockeyTable) -> PuckModel:
 
 
 def widening(
-    steps: LabelledSteps, table: HockeyTable, *, level: float = 0.95, folds: int = 5
+    steps: LabelledSteps, table: HockeyTable, *, levels: Sequence[float] = (0.9, 0.95, 0.99), folds: int = 5
 ) -> dict[str, float]:
     """Factors of the standard deviations with which fits hold for steps that they have not seen.
 
     Bounces and hits scatter with longer tails than a Gaussian. Each fold of the steps is judged by the fit of
-    the others; a factor takes the Gaussian's ellipse of a probability to that share of all steps.
+    the others; a factor takes the Gaussian's ellipses of some probabilities to at least these shares of all
+    steps.
 
     Args:
         steps: to learn from.
         table: geometry.
-        level: the share.
+        levels: the shares.
         folds: parts that the steps are cut into, one after the other left out.
 
     Returns:
@@ -202,9 +203,11 @@ def widening(
         unseen = steps.part(lambda n: np.arange(n) % folds == fold)  # noqa: B023
         for mode, squared in step_distances(unseen, model).items():
             distances[mode].append(squared)
-    allowed = -2.0 * math.log(1.0 - level)  # chi-squared with 2 degrees of freedom
-    reached = {mode: float(np.quantile(np.concatenate(distances[mode]), level)) for mode in _NAMES}
-    return {name: max(1.0, math.sqrt(reached[mode] / allowed)) for mode, name in _NAMES.items()}
+    allowed = -2.0 * np.log1p(-np.asarray(levels))  # chi-squared with 2 degrees of freedom
+    reached = {mode: np.quantile(np.concatenate(distances[mode]), levels) for mode in _NAMES}
+    return {
+        name: max(1.0, math.sqrt(float((reached[mode] / allowed).max()))) for mode, name in _NAMES.items()
+    }
 
 
 def step_distances(steps: LabelledSteps, model: PuckModel) -> dict[int, NDArray[np.float64]]:

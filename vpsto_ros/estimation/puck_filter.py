@@ -176,7 +176,7 @@ class PuckFilter:
             position is known) or "invalid: reason".
         """
         noise = self.config.velocity_std**2 * np.eye(2) if covariance is None else covariance
-        sighting, defect = _checked(0.0, velocity, noise)
+        sighting, defect = _checked(0.0, velocity, noise, "velocity")
         if defect:
             return Outcome("invalid", defect)
         if self._belief is None:
@@ -334,17 +334,20 @@ def _corrected(belief: PuckBelief, sighting: _Sighting, first: int = 0) -> tuple
     return corrected, float(innovation @ inverse @ innovation)
 
 
-def _checked(stamp: object, position: object, covariance: object) -> tuple[_Sighting, str]:
-    """A measured position as numbers, and what is wrong with it."""
+def _checked(
+    stamp: object, measured: object, covariance: object, name: str = "position"
+) -> tuple[_Sighting, str]:
+    """A measured position or velocity as numbers, and what is wrong with it."""
     time, first = finite_array(stamp, ())
-    where, second = finite_array(position, (2,))
+    where, second = finite_array(measured, (2,))
     noise, third = finite_array(covariance, (2, 2))
-    defects = zip(("stamp", "position", "covariance"), (first, second, third), strict=True)
-    defect = "; ".join(f"{name}: {text}" for name, text in defects if text)
+    defects = zip(("stamp", name, "covariance"), (first, second, third), strict=True)
+    defect = "; ".join(f"{part}: {text}" for part, text in defects if text)
     if not defect:
         skew = abs(noise[0, 1] - noise[1, 0]) > 1e-6 * np.abs(noise).max()
         if skew or np.linalg.eigvalsh(noise)[0] < (1.0 - 1e-6) * _LEAST_STD**2:
-            defect = f"covariance: not symmetric positive definite with at least {_LEAST_STD:g} m"
+            unit = "m" if name == "position" else "m/s"
+            defect = f"covariance: not symmetric positive definite with at least {_LEAST_STD:g} {unit}"
     return _Sighting(float(time) if time.shape == () else math.nan, where, noise), defect
 
 

@@ -118,12 +118,15 @@ class ArmLink:
         """Stop the arm again and again until the controller's reference rests, if it says what that is.
 
         No callback runs meanwhile: what the controller says is taken by hand, and its stamps tell the time.
+        A controller that is gone, as when everything is being stopped, is not waited for.
         """
         if self._reported is None or not self._sent:
             return
         give_up = time.monotonic() + STOP_PATIENCE
         while time.monotonic() < give_up:
             time.sleep(0.02)
+            if not self._node.count_publishers(self._desired_input.topic_name):
+                return
             with self._desired_input.handle:
                 taken = self._desired_input.handle.take_message(JointState, False)
             if taken is None:

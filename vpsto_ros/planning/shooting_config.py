@@ -157,7 +157,7 @@ class ShootingConfig:
     time_step: float = option(0.05, "between contact times", unit="s", minimum=0.005, maximum=1.0)
     latest: float = option(2.5, "how far ahead the last contact time is", unit="s", minimum=0.1, maximum=10.0)
     times_per_step: int = option(
-        10, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
+        8, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
         maximum=1000,
     )  # fmt: skip
     policy_times_per_step: int = option(
@@ -214,7 +214,7 @@ class ShootingConfig:
         0.5, "age of the puck's state beyond which it is of no use", unit="s", minimum=0.0, maximum=10.0
     )
     policy_steps: int = option(
-        12, "steps of Algorithm 2 for a contact time, where a policy is used", minimum=1, maximum=200
+        10, "steps of Algorithm 2 for a contact time, where a policy is used", minimum=1, maximum=200
     )
     base: tuple[float, float] = option(
         (-1.51, 0.0), "the robot's base in the table frame", unit="m", minimum=-10.0, maximum=10.0

@@ -55,7 +55,7 @@ class StrikeConfig:
     )  # fmt: skip
     brake: float = option(0.15, "time in which they come to rest", unit="s", minimum=0.11, maximum=1.0)
     lead_weights: tuple[float, ...] = option(
-        (0.5, 1.2, 3.0), "price of postures far from home, per second that the quickest joint motion to them"
+        (0.1, 0.5, 1.2, 3.0), "price of postures far from home, per second that the quickest joint motion to them"
         " takes; for each a layer of the table: fast strikes first, then ones that are soon there",
         unit="m/s²", minimum=0.0, maximum=10.0,
     )  # fmt: skip

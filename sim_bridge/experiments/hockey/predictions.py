@@ -17,6 +17,7 @@ KINDS = ("floating", "wall", "hit", "hit_wall")
 
 _EVERY = 10  # samples between predictions of a puck that floats
 _DENT = 3e-3  # how deep pucks may push into a rim [m]
+_MARGIN = 2e-3  # a puck that comes to a wall within so long is not taken to float [s]
 _LEAD = 1  # whole steps from the start of a prediction to the bounce
 
 
@@ -99,7 +100,8 @@ def _from_sample(
 ) -> Prediction | None:
     """From a true state; None if the puck meets something else than its kind says, or comes into a goal."""
     end = sample + round(horizon / model.period)
-    met = _met(episode, episode.start + sample * model.period, episode.start + end * model.period)
+    over = episode.start + end * model.period + _MARGIN
+    met = _met(episode, episode.start + sample * model.period, over)
     puck = episode.recording.puck
     if sample < 0 or not _seen(episode, end) or MALLET in met or bool(met) != (kind == "wall"):
         return None

@@ -3,15 +3,15 @@
 Every run is two episodes of the simulated world that the model has not seen, one with a fast puck, one with a
 puck that the arm strikes. From true states the model predicts Gaussians for where the puck is 0.1, 0.2 and
 0.5 s later: while it floats, from one step before a bounce, and from the mallet's touch on. Of a calibrated
-model p % of the true places lie in the ellipses of p %.
+model p % of the true places lie in the ellipses of p %. Where a puck may have bounced as usual or lively, the
+prediction is a mixture of Gaussians, and its densest region of p % takes the place of the ellipse.
 
 Coverage counts where something is met: a puck that floats is predicted to fractions of a millimetre, because
 the simulated table is level, and its ellipses, as wide as the fit's least deviation, hold it anyway.
 
-The targets' ranges are not even, for a reason that the training data show: bounces have a narrow core and
-a long tail. A Gaussian that is wide enough for the tail holds more than half of them in its ellipse of 50 %,
-and even then hardly 99 % in that of 99 %. They were set with seeds from 1000 on, before the seeds from 0
-on were looked at.
+The targets' ranges are not even: bounces and hits have longer tails than a Gaussian, and the learned modes
+are widened so that their ellipses of 99 % hold as many, which leaves more than half of them in those of 50 %.
+They were set with seeds from 1000 on, for an earlier model with one kind of bounces.
 """
 
 import argparse
