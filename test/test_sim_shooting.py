@@ -98,7 +98,7 @@ def test_the_baseline_prefers_the_middle_of_the_goal_and_no_rims():
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.0], [NAN, NAN]])
     goal = np.array([1.0, 1.0, 1.0, 0.0])
     outlook = ShotOutlook(goal, goal, goal, offset, np.array([0, 0, 1, 0]))
-    np.testing.assert_allclose(Middle().values(outlook)[:3], [1.0, 0.52, 1.0])
+    np.testing.assert_allclose(Middle().values(outlook)[:3], [1.0, 0.52, -1.0])
     assert Middle().allowed(outlook).tolist() == [True, True, False, False]
     assert np.argmax(Middle().scores(outlook)) == 0
 

@@ -19,14 +19,18 @@ _CERTAIN = 1e-12  # variance of a model that is sure [m²/s²]
 
 @dataclasses.dataclass(frozen=True)
 class Middle(ShootingObjective):
-    """Straight at the middle of the goal, as planners do that know only where the puck is expected."""
+    """Straight at the middle of the goal, as planners do that know only where the puck is expected.
+
+    By way of a rim only where nothing else is possible.
+    """
 
     def values(self, outlook: ShotOutlook) -> NDArray[np.float64]:
-        """1 in the middle of the goal, 0 at its posts, shape (B,)."""
-        return 1.0 - np.nan_to_num(np.abs(outlook.offset[:, 0]), nan=np.inf) / (0.5 * TABLE.goal_width)
+        """1 in the middle of the goal, 0 at its posts, less 2 for shots that meet rims, shape (B,)."""
+        off = np.nan_to_num(np.abs(outlook.offset[:, 0]), nan=np.inf) / (0.5 * TABLE.goal_width)
+        return 1.0 - off - 2.0 * (outlook.banks > 0)
 
     def allowed(self, outlook: ShotOutlook) -> NDArray[np.bool_]:
-        """Shots (B,) that meet no wall and are expected in the goal."""
+        """Shots (B,) that meet no rim and are expected in the goal."""
         return super().allowed(outlook) & (outlook.banks == 0)
 
 
