@@ -214,7 +214,7 @@ class ShootingConfig:
         0.5, "age of the puck's state beyond which it is of no use", unit="s", minimum=0.0, maximum=10.0
     )
     policy_steps: int = option(
-        12, "steps of Algorithm 2 for a contact time, where a policy is used", minimum=1, maximum=200
+        10, "steps of Algorithm 2 for a contact time, where a policy is used", minimum=1, maximum=200
     )
     base: tuple[float, float] = option(
         (-1.51, 0.0), "the robot's base in the table frame", unit="m", minimum=-10.0, maximum=10.0
