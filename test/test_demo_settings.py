@@ -77,7 +77,8 @@ def test_nodes_get_file_seed_and_clock():
     assert str(config_file("push_box.yaml")) in driver
     assert "franka_driver:seed:=3" in driver and "state_estimator:seed:=3" in estimator
     assert "franka_driver:real_time_factor:=2.000000" in driver
-    assert "use_sim_time:=true" in estimator and "use_sim_time:=true" not in driver
+    assert "state_estimator:use_sim_time:=true" in estimator
+    assert not any("use_sim_time" in argument for argument in driver)
     assert not any("seed" in argument for argument in settings.ros_arguments("contact_planner"))
 
 
