@@ -75,10 +75,11 @@ def test_nodes_get_file_seed_and_clock():
     settings = Settings.load("push_box", seed=3, real_time_factor=2.0)
     driver, estimator = settings.ros_arguments("franka_driver"), settings.ros_arguments("state_estimator")
     assert str(config_file("push_box.yaml")) in driver
-    assert "seed:=3" in driver and "seed:=3" in estimator
-    assert "real_time_factor:=2.000000" in driver
-    assert "use_sim_time:=true" in estimator and "use_sim_time:=true" not in driver
-    assert "seed:=3" not in settings.ros_arguments("contact_planner")
+    assert "franka_driver:seed:=3" in driver and "state_estimator:seed:=3" in estimator
+    assert "franka_driver:real_time_factor:=2.000000" in driver
+    assert "state_estimator:use_sim_time:=true" in estimator
+    assert not any("use_sim_time" in argument for argument in driver)
+    assert not any("seed" in argument for argument in settings.ros_arguments("contact_planner"))
 
 
 def test_a_missing_file_says_where_it_was_looked_for():
@@ -99,3 +100,24 @@ def test_parameters_for_all_nodes_count_for_each(tmp_path, monkeypatch):
         "table",
         "table",
     )
+
+
+@pytest.mark.parametrize("demo", list(DEMOS))
+def test_what_the_command_line_says_wins_over_the_file(demo):
+    rclpy = pytest.importorskip("rclpy")
+    from sim_bridge.franka_driver import FrankaDriver
+    from vpsto_ros.nodes.state_estimator import StateEstimator
+
+    settings = Settings.load(demo, seed=7, real_time_factor=0.5)
+    for node_class, name in ((FrankaDriver, "franka_driver"), (StateEstimator, "state_estimator")):
+        rclpy.init(args=["demo", *settings.ros_arguments(name)])
+        try:
+            node = node_class(name)
+            assert node.get_parameter("seed").value == 7
+            if name == "franka_driver":
+                assert node.get_parameter("real_time_factor").value == 0.5
+            else:
+                assert node.get_parameter("use_sim_time").value is True
+            node.destroy_node()
+        finally:
+            rclpy.shutdown()

@@ -109,6 +109,13 @@ def test_a_frame_of_air_hockey_puts_puck_and_hanging_mallet_where_they_belong():
     assert geom.xmat.reshape(3, 3)[2, 2] == pytest.approx(-1.0, abs=1e-9)
 
 
+def test_a_replay_shows_texts_that_change():
+    joints, stage = np.array(START_JOINTS), AirHockeyStage(AirHockeyScene())
+    texts = [Overlay("shot", np.ones((1, 3)), (1.0, 1.0, 1.0), 0.05, text) for text in ("61 %", "62 %")]
+    frames = [Frame(joints, overlays=(text,)) for text in texts] + [Frame(joints)]
+    assert "__VISER_EMBED_DATA__" in replay_page(stage, frames, 20.0)
+
+
 def test_texts_of_nodes_are_written_into_the_picture():
     blank = np.full((video.HEIGHT, video.WIDTH, 3), 255, dtype=np.uint8)
     said = Overlay("shot", np.zeros((1, 3)), (1.0, 1.0, 1.0), 0.05, "97 % to score")

@@ -68,7 +68,7 @@ class System:
         code = f"import sys; from {MODULES[name]} import main; sys.exit(main())"
         simulated = [] if name == "franka_driver" else ["-p", "use_sim_time:=true"]
         # A driver that is slowed down leaves a busy host the time to plan; deadlines are in node time.
-        pace = ["-p", "real_time_factor:=0.5"] if name == "franka_driver" else []
+        pace = ["-p", "franka_driver:real_time_factor:=0.5"] if name == "franka_driver" else []
         command = [sys.executable, "-c", code, "--ros-args", *self.parameters, *simulated, *pace]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
         with open(self.folder / f"{name}.log", "ab") as log:

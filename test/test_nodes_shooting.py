@@ -16,6 +16,7 @@ from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.contact_planner import ContactPlannerNode
+from vpsto_ros.nodes.contact_planner_config import ContactPlannerNodeConfig
 from vpsto_ros.nodes.conversions import SIMULATED, contact_message, read_contact, state_message
 from vpsto_ros.nodes.hockey_table import HockeyTableConfig, strike_table
 from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
@@ -150,6 +151,18 @@ def test_settings_choose_the_objective(bench, setting, weights):
     made = bench(ContactPlannerNode, "contact_planner", setting=setting, **own)
     objective = made.node.task.planner.config.objective
     assert (objective.lambda1, objective.lambda2) == weights
+
+
+def test_a_trained_policy_gives_the_angles_if_asked_to(bench):
+    made = bench(ContactPlannerNode, "contact_planner", tool_frame="mallet", policy=True)
+    for kind, topic in ((Odometry, "object_state"), (JointState, "joint_states")):
+        made.talk(kind, topic)
+    made.listen(Odometry, "contact_plan")
+    made.connect()
+    made.advance(0.5, each=known(made))
+    assert plans(made)[-1].velocity[0] > 0.0
+    with pytest.raises(ConfigurationError, match="conservative"):
+        ContactPlannerNodeConfig(kind="shooting", setting="own", policy=True)
 
 
 # Preview

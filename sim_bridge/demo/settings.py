@@ -76,12 +76,12 @@ class Settings:
         """Command line arguments of a node."""
         arguments = ["--ros-args", "--params-file", str(self.file)]
         if node in SEEDED:
-            arguments += ["-p", f"seed:={self.seed}"]
+            arguments += ["-p", f"{node}:seed:={self.seed}"]
         if node == "franka_driver":
             # A decimal point makes it a ROS double.
-            arguments += ["-p", f"real_time_factor:={self.real_time_factor:.6f}"]
-            return [*arguments, "-p", f"disturbance_hold:={HAND_HOLD}"]
-        return [*arguments, "-p", "use_sim_time:=true"]
+            arguments += ["-p", f"{node}:real_time_factor:={self.real_time_factor:.6f}"]
+            return [*arguments, "-p", f"{node}:disturbance_hold:={HAND_HOLD}"]
+        return [*arguments, "-p", f"{node}:use_sim_time:=true"]
 
 
 def config_file(name: str) -> Path:

@@ -3,6 +3,7 @@
 import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.hockey_table import HockeyTableConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import PUSHING, TASKS, RobotConfig, check_task
@@ -41,6 +42,9 @@ class ContactPlannerNodeConfig(NodeConfig):
         "what is wanted of shots: to score, to score fast, or to be fast; own takes shooting.objective.*",
         choices=(*SETTINGS, OWN_SETTING),
     )
+    policy: bool = option(
+        False, "whether the trained policy of the setting gives the angles of shots instead of direct search"
+    )
     puck_model: str = option("", "file with the learned model of the puck; empty takes the package's")
     robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
@@ -53,3 +57,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     def __post_init__(self) -> None:
         validate(self)
         check_task(self.kind, self.robot, self.goal_orientation)
+        if self.policy and self.setting == OWN_SETTING:
+            raise ConfigurationError(
+                f"policy = True needs a setting that a policy was trained for: {', '.join(SETTINGS)}"
+            )

@@ -18,6 +18,7 @@ from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.shooting import SETTINGS, ShootingPlanner, Shot
+from vpsto_ros.planning.shooting_policy import ShootingPolicy
 from vpsto_ros.planning.shot_preview import ShotPreview, preview
 from vpsto_ros.robot.iiwa import iiwa14
 
@@ -38,7 +39,8 @@ class ShootingContacts:
             shooting = dataclasses.replace(shooting, objective=SETTINGS[config.setting])
         self._model = puck_model(config.puck_model)
         strikes = strike_table(self._table)
-        self.planner = ShootingPlanner(self._model, strikes, shooting)
+        policy = ShootingPolicy.load(config.setting) if config.policy else None
+        self.planner = ShootingPlanner(self._model, strikes, shooting, policy)
         self._warm_up(np.array(strikes.rules.home))
         self.forget()
         self._chances = node.advertise(Float64, "~/goal_probability", reliable(1))

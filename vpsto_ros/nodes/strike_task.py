@@ -90,9 +90,10 @@ class StrikeTask:
         """Compile whatever a strike uses: wait at home, strike, return."""
         planner = self.planner
         q, still = planner.home, np.zeros(7)
-        contact = MalletContact(1.0, np.array([-0.55, 0.0, 1.0, 0.0]))
+        contact = MalletContact(2.0, np.array([-0.58, 0.0, 0.9, 0.0]))
         for index in range(4):
             planner.accept(planner.step(0.02 * index, q, still, contact if index else None))
+        assert planner.contact is not None, "the arm can do this"
         planner.accept(planner.step(0.1, q, still, None))
         planner.stop(0.12)
         planner.reset()
