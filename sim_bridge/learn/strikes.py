@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "example: vpsto learn strikes --effort 1000 --out strikes.npz"
     parser.add_argument(
-        "--effort", type=count, default=8_000, metavar="N",
-        help="postures that are tried per place and direction (default 8000)",
+        "--effort", type=count, default=5_000, metavar="N",
+        help="postures that are tried per place and direction (default 5000)",
     )  # fmt: skip
 
 

@@ -49,7 +49,7 @@ class PlayRules:
         1.05, "largest angle between rod and vertical", unit="rad", minimum=0.1, maximum=1.5
     )
     limit_share: float = option(
-        0.945, "share of the joints' position and velocity limits that is planned; the rules allow 0.95",
+        0.94, "share of the joints' position and velocity limits that is planned; the rules allow 0.95",
         minimum=0.1, maximum=1.0,
     )  # fmt: skip
     acceleration_share: float = option(

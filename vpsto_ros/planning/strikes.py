@@ -55,8 +55,8 @@ class StrikeConfig:
     )  # fmt: skip
     brake: float = option(0.15, "time in which they come to rest", unit="s", minimum=0.11, maximum=1.0)
     lead_weights: tuple[float, ...] = option(
-        (0.1, 0.5, 1.2, 3.0), "price of postures far from home, per second that the quickest joint motion to them"
-        " takes; for each a layer of the table: fast strikes first, then ones that are soon there",
+        (0.1, 0.5, 1.2, 3.0), "price of postures far from home, per second that the quickest joint motion to"
+        " them takes; for each a layer of the table: fast strikes first, then ones that are soon there",
         unit="m/s²", minimum=0.0, maximum=10.0,
     )  # fmt: skip
     lead_factor: float = option(
@@ -64,7 +64,7 @@ class StrikeConfig:
         maximum=3.0,
     )  # fmt: skip
     speed_share: float = option(
-        0.97, "share of the planned velocity limits in a strike: what replanning needs", minimum=0.1,
+        0.975, "share of the planned velocity limits in a strike: what replanning needs", minimum=0.1,
         maximum=1.0,
     )  # fmt: skip
 
