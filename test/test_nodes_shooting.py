@@ -159,7 +159,8 @@ def test_a_trained_policy_gives_the_angles_if_asked_to(bench):
         made.talk(kind, topic)
     made.listen(Odometry, "contact_plan")
     made.connect()
-    made.advance(0.5, each=known(made))
+    made.advance(1.5, each=known(made))
+    assert plans(made), made.node.report().message
     assert plans(made)[-1].velocity[0] > 0.0
     with pytest.raises(ConfigurationError, match="conservative"):
         ContactPlannerNodeConfig(kind="shooting", setting="own", policy=True)
