@@ -20,7 +20,7 @@ setup(
         "vpsto_ros": ["py.typed"],
         "vpsto_ros.robot": ["models/*.xml"],
         "vpsto_ros.contact": ["models/*.json"],
-        "vpsto_ros.planning": ["models/*.npz"],
+        "vpsto_ros.planning.hockey": ["models/*.npz"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/" + PACKAGE]),

@@ -33,12 +33,12 @@ from vpsto_ros.estimation.puck_filter import PuckFilter, PuckState
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
+from vpsto_ros.planning.hockey.rules import PlayRules
+from vpsto_ros.planning.hockey.shooting import ShootingPlanner
+from vpsto_ros.planning.hockey.shot_preview import preview
+from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
-from vpsto_ros.planning.play_rules import PlayRules
-from vpsto_ros.planning.shooting import ShootingPlanner
-from vpsto_ros.planning.shot_preview import preview
-from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc
-from vpsto_ros.planning.strikes import StrikeTable, tabulate
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.robot.mallet_observer import MalletObserver
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, synthesize_batch

@@ -23,8 +23,8 @@ from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajecto
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.planning.contact import ContactPlan
-from vpsto_ros.planning.shooting_config import ShootingConfig, Shot
-from vpsto_ros.planning.shot_preview import preview
+from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shot_preview import preview
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
 from vpsto_ros.trajectory import Trajectory
 

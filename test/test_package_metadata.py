@@ -134,7 +134,7 @@ def test_the_library_needs_neither_ros_nor_a_simulator():
     loaded = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.split()
-    assert {"vpsto_ros.trajectory", "vpsto_ros.planning.hockey_agent"} <= set(loaded)
+    assert {"vpsto_ros.trajectory", "vpsto_ros.planning.hockey.agent"} <= set(loaded)
     tops = {name.split(".")[0] for name in loaded}
     assert tops.isdisjoint(HEAVY)
 

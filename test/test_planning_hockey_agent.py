@@ -11,10 +11,10 @@ import pytest
 from vpsto_ros.contact.puck import SHIPPED as PUCK_MODEL
 from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.hockey_agent import HockeyAgent, HockeyAgentConfig, Observation, PuckSighting
-from vpsto_ros.planning.play_rules import PlayRules
-from vpsto_ros.planning.strikes import SHIPPED as STRIKES
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.agent import HockeyAgent, HockeyAgentConfig, Observation, PuckSighting
+from vpsto_ros.planning.hockey.rules import PlayRules
+from vpsto_ros.planning.hockey.strikes import SHIPPED as STRIKES
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 
@@ -342,7 +342,7 @@ def test_missing_and_damaged_models_are_errors_with_a_remedy(tmp_path, module):
 
 def test_a_package_without_its_models_says_so_when_the_agent_is_made(monkeypatch, tmp_path):
     missing = tmp_path / "puck.json"
-    monkeypatch.setattr("vpsto_ros.planning.hockey_agent.PUCK_MODEL", missing)
+    monkeypatch.setattr("vpsto_ros.planning.hockey.agent.PUCK_MODEL", missing)
     with pytest.raises(ConfigurationError, match=r"puck\.json.*vpsto learn"):
         HockeyAgent()
 

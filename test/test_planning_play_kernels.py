@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.planning.play_motions import ArmState, Play, PlayMotion
-from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion
+from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.trajectory import OptimalBasis

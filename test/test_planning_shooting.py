@@ -10,8 +10,8 @@ from strikes_bench import START, StandInStrikes
 
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.planning.shooting import SETTINGS, ShootingConfig, ShootingPlanner
-from vpsto_ros.planning.shooting_policy import EnergyModel, ShootingPolicy
+from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingConfig, ShootingPlanner
+from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy
 
 MODEL = PuckModel.load(SHIPPED)
 NOISE = np.array([7e-4, 7e-4, 5e-3, 5e-3])

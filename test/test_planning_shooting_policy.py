@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.shooting_config import SETTINGS
-from vpsto_ros.planning.shooting_policy import (
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS
+from vpsto_ros.planning.hockey.shooting_policy import (
     LAYERS,
     EnergyModel,
     PolicySamples,
     ShootingPolicy,
     save_policies,
 )
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 LOW = np.array([-0.7, -0.4, -1.0, -1.0, -1.2])
 HIGH = np.array([-0.2, 0.4, 1.0, 1.0, 1.2])

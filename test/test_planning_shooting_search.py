@@ -10,8 +10,8 @@ from strikes_bench import StandInStrikes
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_motion import hit_time
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig, ShootingObjective, Shot
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, ShootingObjective, Shot
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
 
 MODEL, STRIKES = PuckModel.load(SHIPPED), StandInStrikes()
 DISTANCE = MODEL.table.contact_distance

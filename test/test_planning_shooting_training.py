@@ -8,10 +8,10 @@ from strikes_bench import StandInStrikes
 
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig
-from vpsto_ros.planning.shooting_policy import EnergyModel, ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch
-from vpsto_ros.planning.shooting_training import (
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig
+from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch
+from vpsto_ros.planning.hockey.shooting_training import (
     Examples,
     TrainingConfig,
     examples,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from vpsto_ros.planning.play_rules import PlayRules
-from vpsto_ros.planning.strike_search import fastest, rate_posture, search_posture, straighten
+from vpsto_ros.planning.hockey.rules import PlayRules
+from vpsto_ros.planning.hockey.strike_search import fastest, rate_posture, search_posture, straighten
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import chain, jacobian
 

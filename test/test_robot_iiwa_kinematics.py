@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import (
     FOREARM,

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.mallet_tilt import MalletTilt
 from vpsto_ros.trajectory import Trajectory

@@ -6,9 +6,9 @@ import pytest
 from sim_bridge.hockey import table
 from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand
-from vpsto_ros.planning.hockey_agent import HockeyAgent, Observation, PuckSighting
-from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.agent import HockeyAgent, Observation, PuckSighting
+from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import JOINT_NAMES
 
 TABLE = StrikeTable.load()

@@ -5,7 +5,7 @@ import pytest
 
 from sim_bridge.hockey.world import AirHockeyWorld, ArmGains
 from sim_bridge.impedance import JointController
-from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.robot.iiwa import iiwa14
 
 HOME, ROBOT, GAINS = np.array(PlayRules().home), iiwa14(), ArmGains()

@@ -43,7 +43,7 @@ from sim_bridge.hockey.recordings import Strike, strike_command
 from sim_bridge.hockey.scene import AirHockeyScene
 from sim_bridge.hockey.world import AirHockeyWorld
 from vpsto_ros.contact.puck import ShotOutlook
-from vpsto_ros.planning.shooting_config import SETTINGS, Shot
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, Shot
 
 NAN = math.nan
 

@@ -10,9 +10,9 @@ from sim_bridge import cli
 from sim_bridge.experiments.hockey import shooting_policy as experiment
 from sim_bridge.experiments.hockey.shooting_comparison import STEPS, compare, shot_at
 from sim_bridge.learn.shooting_policy import input_range, learn
-from vpsto_ros.planning.shooting_config import SETTINGS
-from vpsto_ros.planning.shooting_policy import EnergyModel, ShootingPolicy, save_policies
-from vpsto_ros.planning.shooting_training import TrainingConfig, states
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS
+from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy, save_policies
+from vpsto_ros.planning.hockey.shooting_training import TrainingConfig, states
 
 CONFIG = TrainingConfig(states=60, actions=30, epochs=2, batch=20, negatives=8)
 

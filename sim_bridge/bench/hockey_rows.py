@@ -15,11 +15,11 @@ from sim_bridge.bench.belief_rows import processor_time
 from sim_bridge.bench.measuring import Action, Cores, Row, at_most
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.planning.shooting import SETTINGS, ShootingConfig, ShootingPlanner
-from vpsto_ros.planning.shooting_policy import ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch
-from vpsto_ros.planning.shooting_training import TrainingConfig, states
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingConfig, ShootingPlanner
+from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch
+from vpsto_ros.planning.hockey.shooting_training import TrainingConfig, states
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 PERIOD, SHOT_TIME = 0.02, 1.6
 """Of the planner [s]; how long a puck lies or rolls about before the next one comes."""

@@ -13,12 +13,12 @@ from sim_bridge.cli import count, file
 from sim_bridge.experiments.hockey.shooting_comparison import compare
 from sim_bridge.experiments.runs import print_verdict
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig
-from vpsto_ros.planning.shooting_policy import EnergyModel, ShootingPolicy, save_policies
-from vpsto_ros.planning.shooting_search import ShotSearch
-from vpsto_ros.planning.shooting_training import TrainingConfig, examples, states, train
-from vpsto_ros.planning.strikes import SHIPPED as STRIKES
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig
+from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy, save_policies
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch
+from vpsto_ros.planning.hockey.shooting_training import TrainingConfig, examples, states, train
+from vpsto_ros.planning.hockey.strikes import SHIPPED as STRIKES
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 ENOUGH = 0.9
 """Of the best objective, on states that training has not seen, below which a policy is not worth having."""

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from sim_bridge.cli import count
 from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import TABLE
-from vpsto_ros.planning.strikes import StrikeTable, tabulate
+from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
 
 X = np.linspace(-0.75, -0.15, 13)
 Y = np.linspace(-0.44, 0.44, 17)

@@ -10,7 +10,7 @@ from vpsto_ros.nodes.robots import PUSHING, TASKS, RobotConfig, check_task
 from vpsto_ros.nodes.scene import ModelConfig
 from vpsto_ros.planning.belief_space.config import RobustContactPlannerConfig
 from vpsto_ros.planning.contact import ContactPlannerConfig
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig
 from vpsto_ros.planning.workspace import Workspace
 
 OWN_SETTING = "own"

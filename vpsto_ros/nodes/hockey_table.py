@@ -9,7 +9,7 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 UNKNOWN_YAW = np.pi**2 / 3.0
 """Variance of the yaw of a puck, which nobody estimates: any is as likely [rad²]."""

@@ -18,8 +18,8 @@ from vpsto_ros.nodes.robots import (
 from vpsto_ros.nodes.scene import ModelConfig
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space.config import RobustMpcConfig
+from vpsto_ros.planning.hockey.strike_mpc import StrikeMpcConfig
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
-from vpsto_ros.planning.strike_mpc import StrikeMpcConfig
 
 TRANSPORT = 0.004
 """What is left at least for the way from here to the controller [s]."""

@@ -17,9 +17,9 @@ from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.planning.contact import ContactPlan
-from vpsto_ros.planning.shooting import SETTINGS, ShootingPlanner, Shot
-from vpsto_ros.planning.shooting_policy import ShootingPolicy
-from vpsto_ros.planning.shot_preview import ShotPreview, preview
+from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingPlanner, Shot
+from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
+from vpsto_ros.planning.hockey.shot_preview import ShotPreview, preview
 from vpsto_ros.robot.iiwa import iiwa14
 
 SAME_SHOT = 0.02

@@ -6,9 +6,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from vpsto_ros.planning.shooting_config import Shot
-from vpsto_ros.planning.shooting_policy import PolicySamples, ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
+from vpsto_ros.planning.hockey.shooting_config import Shot
+from vpsto_ros.planning.hockey.shooting_policy import PolicySamples, ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
 
 STEPS = 25
 """Of Algorithm 2, from uniform samples."""

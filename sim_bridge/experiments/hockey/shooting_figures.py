@@ -12,8 +12,8 @@ from sim_bridge.experiments.hockey.shooting_summary import reliability
 from sim_bridge.experiments.hockey.shooting_trials import ShotResult
 from sim_bridge.hockey.recordings import TABLE
 from vpsto_ros.contact.puck import PuckModel
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig, Shot
-from vpsto_ros.planning.shooting_search import ShotSearch
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch
 
 PUCK = np.array([-0.45, 0.1, 0.0, 0.0])
 """At rest, from where single shots are looked at, table frame."""

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from sim_bridge.hockey.recordings import TABLE
 from vpsto_ros.contact.linear_gaussian import LinearGaussian
 from vpsto_ros.contact.puck import SHIPPED, PuckModel, ShotOutlook
-from vpsto_ros.planning.hockey_agent import HockeyAgent, HockeyAgentConfig
-from vpsto_ros.planning.shooting import ShootingPlanner
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig, ShootingObjective
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.agent import HockeyAgent, HockeyAgentConfig
+from vpsto_ros.planning.hockey.shooting import ShootingPlanner
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, ShootingObjective
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 _CERTAIN = 1e-12  # variance of a model that is sure [m²/s²]
 

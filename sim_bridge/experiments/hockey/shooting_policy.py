@@ -25,11 +25,11 @@ from sim_bridge.experiments.runs import (
 )
 from vpsto_ros.contact.puck import SHIPPED as MODEL
 from vpsto_ros.contact.puck import PuckModel
-from vpsto_ros.planning.shooting_config import SETTINGS, ShootingConfig, Shot
-from vpsto_ros.planning.shooting_policy import SHIPPED, ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch
-from vpsto_ros.planning.shooting_training import TrainingConfig, states
-from vpsto_ros.planning.strikes import StrikeTable
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shooting_policy import SHIPPED, ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch
+from vpsto_ros.planning.hockey.shooting_training import TrainingConfig, states
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 PUCKS = 10
 """Per run and setting."""

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from sim_bridge.experiments.hockey.shooting_comparison import STEPS
 from sim_bridge.hockey.recordings import TABLE
-from vpsto_ros.planning.shooting_config import SETTINGS
-from vpsto_ros.planning.shooting_policy import PolicySamples, ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS
+from vpsto_ros.planning.hockey.shooting_policy import PolicySamples, ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch
 
 SHOWN = (1, 12, STEPS)
 """Steps of Algorithm 2."""

@@ -15,8 +15,8 @@ from sim_bridge.hockey.contact_log import MALLET, PuckContact
 from sim_bridge.hockey.recordings import mallet_state, puck_state
 from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
-from vpsto_ros.planning.hockey_agent import JointReferences, Observation, PuckSighting
-from vpsto_ros.planning.shooting_config import Shot
+from vpsto_ros.planning.hockey.agent import JointReferences, Observation, PuckSighting
+from vpsto_ros.planning.hockey.shooting_config import Shot
 
 STEPS = 20
 """Steps of the world, 1 ms each, in a cycle of the agent."""

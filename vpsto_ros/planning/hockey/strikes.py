@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.play_rules import PlayRules
-from vpsto_ros.planning.strike_search import search_posture
+from vpsto_ros.planning.hockey.rules import PlayRules
+from vpsto_ros.planning.hockey.strike_search import search_posture
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import add_least_motion, move_to
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.planning.shooting_config import ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
 
 _NUDGE = np.array([1e-5, 1e-5, 1e-4, 1e-4])  # of a state, to see what it changes [m, m/s]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.contact.puck import PuckModel, ShotOutlook
-from vpsto_ros.planning.shooting_config import ShootingConfig, Shot, Strikes
+from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot, Strikes
 
 _LEAST_CLOSING = 0.05  # slower mallets hardly touch [m/s]
 

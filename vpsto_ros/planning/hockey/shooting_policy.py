@@ -1,6 +1,6 @@
 """The energy-based shooting policy (5.3.3, 5.3.4): angles of low energy are good shots, found by sampling.
 
-Only NumPy is needed to use one; :mod:`vpsto_ros.planning.shooting_training` trains it.
+Only NumPy is needed to use one; :mod:`vpsto_ros.planning.hockey.shooting_training` trains it.
 """
 
 import dataclasses

@@ -10,16 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from vpsto_ros.contact.puck import PuckModel, ShotOutlook
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.planning.shooting_config import (
+from vpsto_ros.planning.hockey.shooting_config import (
     SETTINGS,
     ShootingConfig,
     ShootingObjective,
     Shot,
     Strikes,
 )
-from vpsto_ros.planning.shooting_policy import PolicySamples, ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
-from vpsto_ros.planning.shooting_times import ContactTimes, Round
+from vpsto_ros.planning.hockey.shooting_policy import PolicySamples, ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
+from vpsto_ros.planning.hockey.shooting_times import ContactTimes, Round
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
 

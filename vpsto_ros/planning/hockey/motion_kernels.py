@@ -1,4 +1,4 @@
-"""Compiled costs of candidate motions at the air-hockey table; see :mod:`vpsto_ros.planning.play_motions`."""
+"""Compiled costs of motions at the air-hockey table; see :mod:`vpsto_ros.planning.hockey.motions`."""
 
 import numpy as np
 from numba import njit

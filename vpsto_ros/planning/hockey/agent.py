@@ -20,13 +20,13 @@ from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.estimation.measurement import finite_array
 from vpsto_ros.estimation.puck_filter import PuckFilter, PuckFilterConfig, PuckState
 from vpsto_ros.exceptions import InvalidInputError
+from vpsto_ros.planning.hockey.shooting import ShootingPlanner
+from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
+from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc, StrikeMpcConfig
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.running_reference import MpcStep
-from vpsto_ros.planning.shooting import ShootingPlanner
-from vpsto_ros.planning.shooting_config import ShootingConfig, Shot
-from vpsto_ros.planning.shooting_policy import ShootingPolicy
 from vpsto_ros.planning.stitching import extended
-from vpsto_ros.planning.strike_mpc import MalletContact, StrikeMpc, StrikeMpcConfig
-from vpsto_ros.planning.strikes import StrikeTable
 
 _WARM_UP = 120  # observations of an imaginary puck
 

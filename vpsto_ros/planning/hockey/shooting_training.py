@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InvalidInputError
-from vpsto_ros.planning.shooting_config import ShootingObjective
-from vpsto_ros.planning.shooting_policy import LAYERS, EnergyModel
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
+from vpsto_ros.planning.hockey.shooting_config import ShootingObjective
+from vpsto_ros.planning.hockey.shooting_policy import LAYERS, EnergyModel
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
 
 Weights = dict[str, NDArray[np.float32]]
 _CHUNK = 50  # states that are weighed at once

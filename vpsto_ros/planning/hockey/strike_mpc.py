@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.vpsto import VpstoConfig
+from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion
+from vpsto_ros.planning.hockey.strikes import Cell, StrikeTable
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
-from vpsto_ros.planning.play_motions import ArmState, Play, PlayMotion
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import extended, resting
-from vpsto_ros.planning.strikes import Cell, StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.robot.mallet_tilt import MalletTilt

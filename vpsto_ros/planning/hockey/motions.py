@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.optimization.progress import Evaluation
-from vpsto_ros.planning.play_kernels import assess, to_height
-from vpsto_ros.planning.play_rules import PlayRules
+from vpsto_ros.planning.hockey.motion_kernels import assess, to_height
+from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.priors.smoothness import smoothness_prior
 from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, minimal_duration

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.planning.shooting_config import Shot
-from vpsto_ros.planning.shooting_policy import ShootingPolicy
-from vpsto_ros.planning.shooting_search import ShotSearch, Strokes
+from vpsto_ros.planning.hockey.shooting_config import Shot
+from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
+from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
 from vpsto_ros.robot.iiwa import iiwa14
 
 Objection = tuple[int, str]

@@ -75,7 +75,7 @@ class PlayRules:
         )  # fmt: skip
 
     def kernel_row(self) -> NDArray[np.float64]:
-        """The places that are allowed, as :mod:`vpsto_ros.planning.play_kernels` takes them, shape (6,)."""
+        """Places that are allowed, as :mod:`vpsto_ros.planning.hockey.motion_kernels` takes them, (6,)."""
         return np.array([
             self.height, self.height_tolerance, self.least_x, self.most_y, self.clearance,
             math.cos(self.rod_tilt),

@@ -1,0 +1,1 @@
+"""Air hockey (chapter 5): contact planning, strikes of the arm, and an agent that plays."""
