@@ -374,16 +374,19 @@ class StrikeMpc(ReferencePlanner):
         return ArmState(contact.time, found[0], found[1] / max(1.0, excess))
 
     def _follow_through(self, target: ArmState) -> Trajectory:
-        """On at the speed of the touch while it lasts, then home.
+        """Straight on at the speed of the touch while it lasts, if joints can, then home.
 
         Raises:
             InfeasibleError: no such motion keeps limits and rules.
         """
         hold = self.table.config.hold
-        rows = np.stack([target.position, target.position + hold * target.velocity])
-        rates = np.stack([target.velocity, target.velocity])
-        on = Trajectory.from_points(np.array([target.time, target.time + hold]), rows, rates)
-        return on.followed_by(self._homewards(ArmState(target.time + hold, rows[1], target.velocity)))
+        after = self.table.straight_on(target.position, target.velocity, hold)
+        if (np.abs(after[1]) > self.play.limits.velocity).any():
+            after = target.position + hold * target.velocity, target.velocity
+        times = np.array([target.time, target.time + hold])
+        rows, rates = np.stack([target.position, after[0]]), np.stack([target.velocity, after[1]])
+        on = Trajectory.from_points(times, rows, rates)
+        return on.followed_by(self._homewards(ArmState(target.time + hold, *after)))
 
     def _homewards(self, begin: ArmState) -> Trajectory:
         """From a state to rest at home.

@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.planning.hockey.rules import PlayRules
-from vpsto_ros.planning.hockey.strike_search import search_posture
+from vpsto_ros.planning.hockey.strike_search import search_posture, straighten
 from vpsto_ros.robot.iiwa import iiwa14
-from vpsto_ros.robot.iiwa_kinematics import add_least_motion, move_to
+from vpsto_ros.robot.iiwa_kinematics import add_least_motion, chain, jacobian, move_to
 
 FORMAT = "vpsto_ros strikes 2"
 SHIPPED = pathlib.Path(__file__).parent / "models" / "strikes.npz"
@@ -235,6 +235,19 @@ class StrikeTable:
         qd *= share
         return (q, qd) if _settle(q, qd, x, y, self.rules.height, vx, vy) else None
 
+    def straight_on(
+        self, position: NDArray, velocity: NDArray, duration: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Joint positions and velocities (7,) after the universal joint has gone on straight and evenly.
+
+        To second order, with the least joint acceleration: a contact takes its time, and with even joint
+        velocities the mallet would turn by some degrees meanwhile.
+        """
+        curvature = np.zeros(7)
+        _curve(position, velocity, curvature)
+        after = velocity + duration * curvature
+        return position + 0.5 * duration * (velocity + after), after
+
     def start(self, cell: Cell) -> NDArray[np.float64]:
         """About where the run-up of an entry begins at rest, joint positions (7,) [rad]."""
         return self._starts[cell]
@@ -389,6 +402,17 @@ def _settle(q, qd, x, y, z, vx, vy):
         ex, ey, ez = ex - jac[0, k] * qd[k], ey - jac[1, k] * qd[k], ez - jac[2, k] * qd[k]
     add_least_motion(jac, ex, ey, ez, qd)
     return True
+
+
+@njit(cache=True, nogil=True)
+def _curve(q, qd, curvature):
+    """The joint acceleration (7,) with which the universal joint keeps its velocity."""
+    points, axes, jac, other, probe = (
+        np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6)), np.empty((3, 6)), np.empty(7)
+    )  # fmt: skip
+    chain(q, points, axes)
+    jacobian(points, axes, jac)
+    straighten(q, qd, jac, curvature, probe, points, axes, other)
 
 
 @njit(cache=True, nogil=True)
