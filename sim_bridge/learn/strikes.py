@@ -12,7 +12,7 @@ from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import TABLE
 from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
 
-X = np.linspace(-0.75, -0.05, 15)
+X = np.linspace(-0.75, -0.10, 14)
 Y = np.linspace(-0.44, 0.44, 17)
 ANGLE = np.deg2rad(np.linspace(-75.0, 75.0, 21))
 _IN_FRONT = np.deg2rad(30.0)  # shots that are nearly straight [rad]

@@ -4,10 +4,11 @@ A weak controller holds the mallet vertical. Its damping acts on the joint's own
 dragged along while the rod turns, and its weight lags behind while the joint accelerates. For small angles,
 seen from the world,
 
-    I tau'' = -k tau - d (tau' - r) - m c a,
+    I tau'' = -(k A + m c g) tau - d A (tau' - r) - m c a,
 
 with the tilt tau of the lower end towards x and y, the rate r at which the rod's lower end turns, and the
-acceleration a of the joint. Frame: the robot's base.
+acceleration a of the joint. A is the unit matrix where the axis of the first hinge, the rod's y axis, is
+horizontal. Frame: the robot's base.
 """
 
 import dataclasses
@@ -21,6 +22,11 @@ from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.robot.iiwa_kinematics import chain, jacobian
 from vpsto_ros.trajectory import Trajectory
 
+_GRAVITY = 9.81  # [m/s²]
+_LEAST_LEVEL = 0.05  # square of the horizontal part of the first hinge's axis
+_UPRIGHT = 0.004  # a mallet that leans less touches in between the puck's edges [rad]
+_SWING_ON = 0.003  # by which it leans farther ahead while the contact lasts [rad]
+
 
 @documented
 @dataclasses.dataclass(frozen=True)
@@ -32,10 +38,9 @@ class MalletTilt:
     """
 
     stiffness: float = option(
-        4.19, "of the joint towards the vertical, the mallet's weight included", unit="Nm/rad", minimum=0.1,
-        maximum=1000.0,
+        4.0, "of each hinge towards the vertical", unit="Nm/rad", minimum=0.1, maximum=1000.0
     )  # fmt: skip
-    damping: float = option(0.31, "of the joint", unit="Nm s/rad", minimum=0.0, maximum=100.0)
+    damping: float = option(0.31, "of each hinge", unit="Nm s/rad", minimum=0.0, maximum=100.0)
     inertia: float = option(
         0.0063, "of the mallet about the joint", unit="kg m²", minimum=1e-5, maximum=1.0
     )
@@ -46,6 +51,10 @@ class MalletTilt:
     offset: float = option(
         0.0505, "from the joint down to the mallet's centre", unit="m", minimum=0.0, maximum=0.5
     )
+    puck: tuple[float, float] = option(
+        (0.0483, 0.0655), "from the joint down to where a mallet that leans back, or ahead, touches the puck:"
+        " near its upper or its lower edge", unit="m", minimum=0.0, maximum=0.5,
+    )  # fmt: skip
     step: float = option(0.004, "of the integration", unit="s", minimum=1e-4, maximum=0.02)
 
     def __post_init__(self) -> None:
@@ -84,10 +93,25 @@ class MalletTilt:
         """Place [m] and velocity [m/s] of the mallet's centre relative to the joint, each (2,)."""
         return self.offset * np.sin(state[:2]), self.offset * np.cos(state[:2]) * state[2:]
 
+    def touching(self, state: NDArray, direction: NDArray) -> NDArray[np.float64]:
+        """Where the mallet's axis is relative to the joint, (2,) [m], at the height at which it touches.
+
+        A mallet whose lower end swings ahead touches the puck's lower edge, else the upper one: if it leans
+        aside as well, its axis is elsewhere at that height than at its centre.
+
+        Args:
+            state: tilt and rates (4,).
+            direction: towards the puck, a unit vector (2,).
+        """
+        upper, lower = self.puck
+        ahead = float(direction @ state[:2]) + _SWING_ON
+        share = min(max(ahead / _UPRIGHT, -1.0), 1.0)
+        return (0.5 * (upper + lower) + 0.5 * share * (lower - upper)) * np.tan(state[:2])
+
 
 @njit(cache=True, nogil=True)
 def _drive(q, qd, qdd, row, arm, axes, jac, out):
-    """What turns the mallet besides its own state: d r - m c a, towards x and y."""
+    """A node of the integration: d A r - m c a towards x and y, and the matrix A (xx, xy, yy)."""
     chain(q, arm, axes)
     jacobian(arm, axes, jac)
     wx, wy = 0.0, 0.0
@@ -105,28 +129,58 @@ def _drive(q, qd, qdd, row, arm, axes, jac, out):
         ux, uy, uz = axes[k, 0] * qd[k], axes[k, 1] * qd[k], axes[k, 2] * qd[k]
         ax += uy * (jac[2, k] * qd[k] + 2.0 * vz) - uz * (jac[1, k] * qd[k] + 2.0 * vy)
         ay += uz * (jac[0, k] * qd[k] + 2.0 * vx) - ux * (jac[2, k] * qd[k] + 2.0 * vz)
-    out[0] = row[1] * -wy - row[3] * ax
-    out[1] = row[1] * wx - row[3] * ay
+    _stiffening(q, axes, out)
+    rx, ry = -wy, wx  # of the rod's lower end
+    out[0] = row[1] * (out[2] * rx + out[3] * ry) - row[3] * ax
+    out[1] = row[1] * (out[3] * rx + out[4] * ry) - row[3] * ay
+
+
+@njit(cache=True, nogil=True)
+def _stiffening(q, axes, out):
+    """The matrix A (xx, xy, yy): the first hinge turns about an axis that may not be horizontal.
+
+    The more upright it is, the more it has to turn for the same swing, and the stiffer it seems.
+    """
+    c, s = np.cos(q[6]), np.sin(q[6])
+    # The rod's y axis; those of joints 6 and 7 and their product are its frame before joint 7 turns.
+    xx = axes[5, 1] * axes[6, 2] - axes[5, 2] * axes[6, 1]
+    xy = axes[5, 2] * axes[6, 0] - axes[5, 0] * axes[6, 2]
+    yx, yy = c * axes[5, 0] - s * xx, c * axes[5, 1] - s * xy
+    level = max(yx * yx + yy * yy, _LEAST_LEVEL)
+    more = (1.0 / level - 1.0) / level
+    out[2], out[3], out[4] = 1.0 + more * yy * yy, -more * yy * yx, 1.0 + more * yx * yx
+
+
+@njit(cache=True, nogil=True)
+def _accelerations(node, row, tx, ty, rx, ry):
+    """Of the tilt (tx, ty) with rates (rx, ry)."""
+    k, d, inertia, weight = row[0], row[1], row[2], row[3] * _GRAVITY
+    sx, sy = k * tx + d * rx, k * ty + d * ry
+    return (
+        (node[0] - weight * tx - node[2] * sx - node[3] * sy) / inertia,
+        (node[1] - weight * ty - node[3] * sx - node[4] * sy) / inertia,
+    )
 
 
 @njit(cache=True, nogil=True)
 def _swing(q, qd, qdd, step, row, state):
     """Integrate the tilt (4,) in place over samples at half steps (2 K + 1, 7), by Runge and Kutta's rule."""
     arm, axes, jac = np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6))
-    drives = np.empty((3, 2))
-    k, d, inertia = row[0], row[1], row[2]
-    _drive(q[0], qd[0], qdd[0], row, arm, axes, jac, drives[0])
+    nodes, h = np.empty((3, 5)), step
+    _drive(q[0], qd[0], qdd[0], row, arm, axes, jac, nodes[0])
     for i in range(q.shape[0] // 2):
-        _drive(q[2 * i + 1], qd[2 * i + 1], qdd[2 * i + 1], row, arm, axes, jac, drives[1])
-        _drive(q[2 * i + 2], qd[2 * i + 2], qdd[2 * i + 2], row, arm, axes, jac, drives[2])
-        for c in range(2):
-            t, r = state[c], state[2 + c]
-            a1 = (drives[0, c] - k * t - d * r) / inertia
-            a2 = (drives[1, c] - k * (t + 0.5 * step * r) - d * (r + 0.5 * step * a1)) / inertia
-            t3, r3 = t + 0.5 * step * (r + 0.5 * step * a1), r + 0.5 * step * a2
-            a3 = (drives[1, c] - k * t3 - d * r3) / inertia
-            t4, r4 = t + step * (r + 0.5 * step * a2), r + step * a3
-            a4 = (drives[2, c] - k * t4 - d * r4) / inertia
-            state[c] = t + step * r + step * step * (a1 + a2 + a3) / 6.0
-            state[2 + c] = r + step * (a1 + 2.0 * a2 + 2.0 * a3 + a4) / 6.0
-        drives[0, 0], drives[0, 1] = drives[2, 0], drives[2, 1]
+        _drive(q[2 * i + 1], qd[2 * i + 1], qdd[2 * i + 1], row, arm, axes, jac, nodes[1])
+        _drive(q[2 * i + 2], qd[2 * i + 2], qdd[2 * i + 2], row, arm, axes, jac, nodes[2])
+        x, y, u, v = state[0], state[1], state[2], state[3]
+        ax1, ay1 = _accelerations(nodes[0], row, x, y, u, v)
+        u2, v2 = u + 0.5 * h * ax1, v + 0.5 * h * ay1
+        ax2, ay2 = _accelerations(nodes[1], row, x + 0.5 * h * u, y + 0.5 * h * v, u2, v2)
+        u3, v3 = u + 0.5 * h * ax2, v + 0.5 * h * ay2
+        ax3, ay3 = _accelerations(nodes[1], row, x + 0.5 * h * u2, y + 0.5 * h * v2, u3, v3)
+        u4, v4 = u + h * ax3, v + h * ay3
+        ax4, ay4 = _accelerations(nodes[2], row, x + h * u3, y + h * v3, u4, v4)
+        state[0] = x + h * (u + 2.0 * u2 + 2.0 * u3 + u4) / 6.0
+        state[1] = y + h * (v + 2.0 * v2 + 2.0 * v3 + v4) / 6.0
+        state[2] = u + h * (ax1 + 2.0 * ax2 + 2.0 * ax3 + ax4) / 6.0
+        state[3] = v + h * (ay1 + 2.0 * ay2 + 2.0 * ay3 + ay4) / 6.0
+        nodes[0] = nodes[2]

@@ -55,6 +55,10 @@ class StrikeMpcConfig:
         0.1, "how far a joint may be from its reference before the arm counts as lost", unit="rad",
         minimum=1e-3, maximum=1.0,
     )  # fmt: skip
+    middle: float = option(
+        0.009, "when in a contact the mallet is to move as asked for: it swings on meanwhile", unit="s",
+        minimum=0.0, maximum=0.05,
+    )  # fmt: skip
     slower: float = option(
         0.1, "share by which the mallet may be slower at the touch than asked for", minimum=0.0, maximum=0.9
     )
@@ -363,7 +367,10 @@ class StrikeMpc(ReferencePlanner):
         if motion is not None and self._swing is not None:
             tilt = self.config.tilt
             begin, state = self._swing
-            aside, rate = tilt.displacement(tilt.along(motion, contact.time, begin, state))
+            touching = tilt.along(motion, contact.time, begin, state)
+            middle = tilt.along(motion, contact.time + self.config.middle, contact.time, touching)
+            aside = tilt.touching(touching, mallet[2:] / np.hypot(mallet[2], mallet[3]))
+            rate = tilt.displacement(middle)[1]
         place, velocity = mallet[:2] + self.table.rules.table - aside, mallet[2:] - rate
         found = self.table.contact(cell, place, velocity)
         if found is None:
