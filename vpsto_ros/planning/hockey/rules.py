@@ -48,9 +48,13 @@ class PlayRules:
     rod_tilt: float = option(
         1.05, "largest angle between rod and vertical", unit="rad", minimum=0.1, maximum=1.5
     )
-    limit_share: float = option(
-        0.94, "share of the joints' position and velocity limits that is planned; the rules allow 0.95",
-        minimum=0.1, maximum=1.0,
+    position_share: float = option(
+        0.94, "share of the joints' position limits that is planned; the rules allow 0.95", minimum=0.1,
+        maximum=1.0,
+    )  # fmt: skip
+    velocity_share: float = option(
+        0.92, "share of the joints' velocity limits that is planned; the rules allow 0.95, and weakly damped"
+        " joints overshoot", minimum=0.1, maximum=1.0,
     )  # fmt: skip
     acceleration_share: float = option(
         0.98, "share of the joints' acceleration limits that is planned", minimum=0.1, maximum=1.0
@@ -68,9 +72,9 @@ class PlayRules:
         """The limits that are planned with."""
         full = robot.limits
         lower, upper = robot.position_range
-        middle, half = 0.5 * (lower + upper), 0.5 * self.limit_share * (upper - lower)
+        middle, half = 0.5 * (lower + upper), 0.5 * self.position_share * (upper - lower)
         return Limits(
-            self.limit_share * full.velocity, self.acceleration_share * full.acceleration,
+            self.velocity_share * full.velocity, self.acceleration_share * full.acceleration,
             middle - half, middle + half,
         )  # fmt: skip
 

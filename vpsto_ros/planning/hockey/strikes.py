@@ -64,7 +64,7 @@ class StrikeConfig:
         maximum=3.0,
     )  # fmt: skip
     speed_share: float = option(
-        0.975, "share of the planned velocity limits in a strike: what replanning needs", minimum=0.1,
+        0.995, "share of the planned velocity limits in a strike: what replanning needs", minimum=0.1,
         maximum=1.0,
     )  # fmt: skip
 
