@@ -204,7 +204,7 @@ def test_what_is_left_of_a_motion_is_its_own_warm_start(play):
 
 def test_the_limits_planned_with_are_shares_within_what_the_rules_allow():
     limits, full = RULES.limits(ROBOT), ROBOT.limits
-    np.testing.assert_allclose(limits.velocity, RULES.limit_share * full.velocity)
+    np.testing.assert_allclose(limits.velocity, RULES.velocity_share * full.velocity)
     lower, upper = ROBOT.position_range
     given = limits.position_range
     assert np.all(given[0] > 0.95 * lower) and np.all(given[1] < 0.95 * upper)
@@ -221,7 +221,8 @@ def test_home_keeps_the_rules():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("height", -1.0), ("limit_share", 1.2), ("home", (0.0, 1.0)), ("rod_tilt", 2.0), ("table_x", math.nan)],
+    [("height", -1.0), ("velocity_share", 1.2), ("home", (0.0, 1.0)), ("rod_tilt", 2.0),
+     ("table_x", math.nan)],  # fmt: skip
 )
 def test_rules_out_of_range_are_named(name, value):
     with pytest.raises(ConfigurationError, match=name):

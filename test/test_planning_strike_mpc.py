@@ -314,17 +314,6 @@ def test_the_same_seed_gives_the_same_plans():
     np.testing.assert_array_equal(*ends)
 
 
-def test_the_mallet_is_below_the_joint_until_it_swings():
-    arm, contact = Arm(), contact_at(11.3)
-    arm.run(10.1)
-    state = arm.mpc.mallet(arm.now, *arm.state())
-    np.testing.assert_allclose(state, [*ROBOT.forward(HOME)[0][:2], 0.0, 0.0], atol=1e-9)
-    arm.run(11.28, contact)
-    q, qd = arm.state()
-    aside = arm.mpc.mallet(arm.now, q, qd)[:2] - ROBOT.forward(q)[0][:2]
-    assert 1e-4 < np.linalg.norm(aside) < 0.03
-
-
 @pytest.mark.parametrize(
     ("now", "q", "qd"),
     [

@@ -36,7 +36,8 @@ class Middle(ShootingObjective):
 
 OBJECTIVES: dict[str, ShootingObjective] = {
     **SETTINGS,
-    "forced_bank": dataclasses.replace(SETTINGS["conservative"], least_banks=1),
+    "aggressive_thesis": dataclasses.replace(SETTINGS["aggressive"], beta=0.5),
+    "forced_bank": dataclasses.replace(SETTINGS["aggressive"], least_banks=1),
     "moving": SETTINGS["conservative"],
 }
 """What the agent wants in each of its settings."""

@@ -27,6 +27,7 @@ from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc, Strik
 from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.planning.stitching import extended
+from vpsto_ros.robot.mallet_observer import MalletObserver
 
 _WARM_UP = 120  # observations of an imaginary puck
 
@@ -148,6 +149,7 @@ class HockeyAgent:
         rng = np.random.default_rng([seed, 1])
         self.planner = ShootingPlanner(model, self._strikes, self.config.shooting, policy, rng)
         self.mpc = StrikeMpc(self._strikes, self.config.mpc, seed=seed)
+        self._mallet = MalletObserver(self.config.mpc.tilt)
         self._warm_up()
 
     def reset(self) -> None:
@@ -155,6 +157,7 @@ class HockeyAgent:
         self.filter.reset()
         self.planner.forget()
         self.mpc.reset()
+        self._mallet.reset()
 
     def act(self, observation: Observation) -> JointReferences:
         """References until the next observation.
@@ -194,7 +197,7 @@ class HockeyAgent:
 
     def _see(self, now: float, q: NDArray, qd: NDArray, sightings: tuple[PuckSighting, ...]) -> list[str]:
         """Take in where mallet and puck are; what was wrong with that."""
-        mallet, complaints = self.mpc.mallet(now, q, qd), []
+        mallet, complaints = self._mallet.observe(now, q, qd), []
         self.filter.observe_mallet(now, mallet[:2] - self._table, mallet[2:])
         for sighting in sightings:
             where, defect = finite_array(sighting.position, (2,))

@@ -85,9 +85,13 @@ class ShootingObjective:
 SETTINGS: dict[str, ShootingObjective] = {
     "conservative": ShootingObjective(1.0, 0.0, 0.5),
     "balanced": ShootingObjective(1.0, 0.2, 0.5),
-    "aggressive": ShootingObjective(0.0, 1.0, 0.5),
+    "aggressive": ShootingObjective(0.0, 1.0, 0.75),
 }
-"""The three of the thesis's experiments, 5.4.2."""
+"""The three of the thesis's experiments, 5.4.2.
+
+Deviation: the aggressive one of the thesis has beta = 0.5. It takes whatever is fast and just likely enough,
+so that with chances that hold it scores about two times in three (the thesis: 0.61).
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -204,19 +204,6 @@ class StrikeMpc(ReferencePlanner):
             return self._withdraw(now, takeover)
         return self._go_on(now)
 
-    def mallet(self, now: float, joint_position: ArrayLike, joint_velocity: ArrayLike) -> NDArray[np.float64]:
-        """State (x, y, vx, vy) of the mallet's centre in the base frame, from the measured joints, (4,).
-
-        How it swings is what the motion that was asked for makes it.
-        """
-        self._follow_mallet(now)
-        aside = (np.zeros(2), np.zeros(2))
-        if self._swing is not None:
-            aside = self.config.tilt.displacement(self._swing[1])
-        q, qd = np.asarray(joint_position, dtype=float), np.asarray(joint_velocity, dtype=float)
-        velocity = self.robot.jacobian(q)[:2] @ qd
-        return np.concatenate([self._tool(q) + aside[0], velocity + aside[1]])
-
     def forget_contact(self) -> None:
         """The touch is over."""
         self.contact, self._cell = None, None
