@@ -221,8 +221,10 @@ def test_home_keeps_the_rules():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("height", -1.0), ("velocity_share", 1.2), ("home", (0.0, 1.0)), ("rod_tilt", 2.0),
-     ("table_x", math.nan)],  # fmt: skip
+    [
+        ("height", -1.0), ("velocity_share", 1.2), ("home", (0.0, 1.0)), ("rod_tilt", 2.0),
+        ("table_x", math.nan),
+    ],
 )
 def test_rules_out_of_range_are_named(name, value):
     with pytest.raises(ConfigurationError, match=name):
