@@ -180,7 +180,7 @@ def test_nonsense_is_refused(options):
 
 def test_the_settings_are_those_of_the_thesis_but_for_one_threshold():
     found = [(o.lambda1, o.lambda2, o.beta, o.least_banks) for o in SETTINGS.values()]
-    assert found == [(1.0, 0.0, 0.5, 0), (1.0, 0.2, 0.5, 0), (0.0, 1.0, 0.75, 0)]
+    assert found == [(1.0, 0.0, 0.5, 0), (1.0, 0.2, 0.5, 0), (0.0, 1.0, 0.7, 0)]
     with pytest.raises(ConfigurationError, match="time_step"):
         ShootingConfig(time_step=0.0)
     assert Shot(0.0, np.zeros(4), 0.0, 1.0, 1.0, 1.0, 0, 1.0).contact_distance == pytest.approx(

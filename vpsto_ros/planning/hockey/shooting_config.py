@@ -85,7 +85,7 @@ class ShootingObjective:
 SETTINGS: dict[str, ShootingObjective] = {
     "conservative": ShootingObjective(1.0, 0.0, 0.5),
     "balanced": ShootingObjective(1.0, 0.2, 0.5),
-    "aggressive": ShootingObjective(0.0, 1.0, 0.75),
+    "aggressive": ShootingObjective(0.0, 1.0, 0.7),
 }
 """The three of the thesis's experiments, 5.4.2.
 
