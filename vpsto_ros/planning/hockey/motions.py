@@ -5,16 +5,19 @@ joint is in the plane of play, so that every candidate stays near it.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vpsto_ros.exceptions import InfeasibleError
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.planning.hockey.motion_kernels import assess, to_height
 from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.priors.smoothness import smoothness_prior
-from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, minimal_duration
+from vpsto_ros.robot.iiwa_kinematics import arm_points, move_to
+from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, minimal_duration, synthesize
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,3 +171,64 @@ class PlayMotion:
         else:
             way = self._guess + (share - 1.0 / n_via) * (self.end.position - self._guess)
         return np.stack([way, self.prior(n_via).mean_points])
+
+
+_RAISED = 0.12  # by how much the universal joint is raised to get over what stands on the table [m]
+_CHECKED = 60  # postures of a motion that are looked at
+_HARDLY = 1e-3  # arms that begin too low may be so much lower on their way [m]
+
+
+def way_in(play: Play, position: NDArray, start: float, share: float) -> Trajectory:
+    """Home from rest outside the plane of play: straight in the joints, or up, across and down; slowly.
+
+    Args:
+        play: rules and limits.
+        position: joint positions at the start, shape (7,) [rad].
+        start: time of the start [s].
+        share: of the velocity limits.
+
+    Raises:
+        InfeasibleError: on either way the arm would touch the table or come too low.
+    """
+    home = np.array(play.rules.home)
+    for keys in ([position, home], [position, _raised(play, position), _raised(play, home), home]):
+        if any(key is None for key in keys):
+            continue
+        way = _straight([key for key in keys if key is not None], play.limits, start, share)
+        if _clear(play, way):
+            return way
+    raise InfeasibleError("the arm cannot get home without coming too low; move it by hand above the table")
+
+
+def _raised(play: Play, position: NDArray) -> NDArray[np.float64] | None:
+    """The posture with the universal joint right above where it is, well above the plane of play."""
+    q, (x, y, z) = position.copy(), arm_points(position[None])[0, 3]
+    arm, axes, jac = np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6))
+    return q if move_to(q, x, y, max(z, play.rules.height) + _RAISED, arm, axes, jac) else None
+
+
+def _straight(keys: list[NDArray], limits: Limits, start: float, share: float) -> Trajectory:
+    """From rest to rest along straight lines between postures."""
+    slow = Limits(share * limits.velocity, share * limits.acceleration)
+    still, whole = np.zeros(len(keys[0])), None
+    for first, second in itertools.pairwise(keys):
+        begin = start if whole is None else whole.end_time
+        part = synthesize(
+            OptimalBasis.uniform(0), np.stack([first, second]), still, still, slow, start_time=begin
+        )
+        whole = part if whole is None else whole.followed_by(part)
+    assert whole is not None
+    return whole
+
+
+def _clear(play: Play, motion: Trajectory) -> bool:
+    """Whether joints keep their range, the universal joint stays above the table and the arm high enough."""
+    rows = motion(np.linspace(motion.start_time, motion.end_time, _CHECKED))
+    points, (lower, upper) = arm_points(rows), play.limits.position_range
+    arm, joint = points[:, 1:3, 2].min(axis=1), points[:, 3, 2]
+    least = min(play.rules.clearance, arm[0] - _HARDLY)
+    lowest = min(play.rules.height - play.rules.height_tolerance, joint[0] - _HARDLY)
+    within = np.all((rows[1:] >= lower) & (rows[1:] <= upper)) or not np.all(
+        (rows[0] >= lower) & (rows[0] <= upper)
+    )
+    return bool(within and arm.min() >= least and joint.min() >= lowest)
