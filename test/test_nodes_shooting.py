@@ -17,7 +17,13 @@ from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.contact_planner import ContactPlannerNode
 from vpsto_ros.nodes.contact_planner_config import ContactPlannerNodeConfig
-from vpsto_ros.nodes.conversions import SIMULATED, contact_message, read_contact, state_message
+from vpsto_ros.nodes.conversions import (
+    SIMULATED,
+    contact_message,
+    read_contact,
+    state_message,
+    withdrawal_message,
+)
 from vpsto_ros.nodes.hockey_table import HockeyTableConfig, strike_table
 from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
@@ -59,7 +65,7 @@ def bench():
 
 @pytest.fixture
 def shooter(bench):
-    made = bench(ContactPlannerNode, "contact_planner", tool_frame="mallet", input_timeout=0.1)
+    made = bench(ContactPlannerNode, "contact_planner", input_timeout=0.1)
     made.talk(Odometry, "object_state")
     made.talk(Odometry, "refused_contact")
     made.talk(JointState, "joint_states")
@@ -88,7 +94,8 @@ def known(bench, place=(-0.5, 0.0)):
 
 
 def plans(bench):
-    return [read_contact(message, SIMULATED, FRAME) for message in bench.received["contact_plan"]]
+    got = bench.received["contact_plan"]
+    return [read_contact(message, SIMULATED, FRAME) for message in got if message.child_frame_id]
 
 
 def test_a_resting_puck_is_shot_at_the_goal_at_one_time(shooter):
@@ -145,6 +152,23 @@ def test_nothing_is_planned_without_puck_or_arm_and_a_far_puck_is_left_alone(sho
     assert not plans(shooter) and shooter.node.report().message.startswith("no shot: ")
 
 
+@pytest.mark.parametrize("loss", ["puck away", "puck silent", "arm silent"])
+def test_a_shot_that_is_dropped_is_called_off_once(shooter, loss):
+    shooter.advance(0.4, each=known(shooter))
+    assert shooter.received["contact_plan"][-1].child_frame_id == "mallet"
+    after = {
+        "puck away": known(shooter, (0.5, 0.0)),
+        "puck silent": lambda _: arm(shooter),
+        "arm silent": lambda _: puck(shooter),
+    }[loss]
+    shooter.advance(0.4, each=after)
+    told = [message.child_frame_id for message in shooter.received["contact_plan"]]
+    first = told.index("")
+    assert set(told[:first]) == {"mallet"} and told[first:] == [""]
+    assert shooter.received["contact_plan"][-1].header.frame_id == FRAME
+    assert shooter.node.task.planner.committed is None
+
+
 @pytest.mark.parametrize(("setting", "weights"), [("aggressive", (0.0, 1.0)), ("own", (3.0, 0.5))])
 def test_settings_choose_the_objective(bench, setting, weights):
     own = {"shooting__objective__lambda1": 3.0, "shooting__objective__lambda2": 0.5}
@@ -154,7 +178,7 @@ def test_settings_choose_the_objective(bench, setting, weights):
 
 
 def test_a_trained_policy_gives_the_angles_if_asked_to(bench):
-    made = bench(ContactPlannerNode, "contact_planner", tool_frame="mallet", policy=True)
+    made = bench(ContactPlannerNode, "contact_planner", policy=True)
     for kind, topic in ((Odometry, "object_state"), (JointState, "joint_states")):
         made.talk(kind, topic)
     made.listen(Odometry, "contact_plan")
@@ -277,6 +301,22 @@ def test_a_shot_that_is_not_told_any_more_is_called_off(striker):
     assert np.abs(trajectory(min(due, trajectory.end_time), 1)).max() < 0.2
 
 
+def test_a_shot_that_is_called_off_is_dropped_within_two_cycles(striker):
+    striker.advance(0.1, each=lambda _: arm(striker))
+    striker.advance(0.2, each=told(striker, striker.time + 1.6))
+    assert striker.node.planner.contact is not None
+    striker.send("contact_plan", withdrawal_message(striker.stamp(), FRAME))
+    striker.advance(0.04, each=lambda _: follow(striker))
+    assert striker.node.planner.contact is None and striker.node.task.contact is None
+    assert not striker.received["refused_contact"]
+
+
+def test_contacts_age_fast_where_they_are_told_in_every_cycle():
+    assert MpcPlannerConfig(kind="shooting", rate=50.0).contact_timeout_in_force == 0.1
+    assert MpcPlannerConfig().contact_timeout_in_force == 0.5
+    assert MpcPlannerConfig(contact_timeout=0.3).contact_timeout_in_force == 0.3
+
+
 def test_an_impossible_contact_is_sent_back(striker):
     striker.advance(0.1, each=lambda _: arm(striker))
     due = striker.time + 1.0
@@ -291,6 +331,7 @@ def test_an_impossible_contact_is_sent_back(striker):
     ("change", "reason"),
     [
         (lambda m: setattr(m.header, "frame_id", "fr3_link0"), "frame 'fr3_link0'"),
+        (lambda m: setattr(m, "child_frame_id", "fr3_tool"), "child_frame_id 'fr3_tool'"),
         (lambda m: setattr(m.pose.pose.position, "x", float("nan")), "finite"),
         (lambda m: setattr(m.twist.twist.linear, "x", 0.0), "moves"),
         (lambda m: setattr(m.header, "stamp", SIMULATED.stamp(0.0)), "over"),

@@ -31,7 +31,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
     goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
     tool_frame: str = option(
-        "fr3_tool", "child_frame_id of contact_plan for pushing and shooting; other robots' tools have names"
+        "fr3_tool", "child_frame_id of contact_plan for pushing; the mallet and other tools have names"
     )
     input_timeout: float = option(
         0.5, "planning pauses when joint states, object states or beliefs are older", unit="s", minimum=0.02,

@@ -11,6 +11,8 @@ from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.planning.hockey.strikes import StrikeTable
 
+MALLET = "mallet"
+"""Frame of the mallet's centre, with the axes of the base frame: child_frame_id of contact_plan."""
 UNKNOWN_YAW = np.pi**2 / 3.0
 """Variance of the yaw of a puck, which nobody estimates: any is as likely [rad²]."""
 UNKNOWN_SPIN = 1e4

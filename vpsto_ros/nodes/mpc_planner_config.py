@@ -58,7 +58,12 @@ class MpcPlannerConfig(NodeConfig):
         0.1, "nothing is published when joint_states are older", unit="s", minimum=0.02, maximum=10.0
     )
     contact_timeout: float = option(
-        0.5, "a contact_plan received longer ago is not used", unit="s", minimum=0.02, maximum=10.0
+        0.0,
+        "a contact_plan received longer ago is not used; 0 takes 0.1 s for shooting, where it comes anew in "
+        "every cycle, and 0.5 s else",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
     )
     goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
     marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
@@ -101,6 +106,11 @@ class MpcPlannerConfig(NodeConfig):
     def lead(self) -> float:
         """Time between the start of planning and the moment a plan takes over [s]."""
         return getattr(self, self._group).lead
+
+    @property
+    def contact_timeout_in_force(self) -> float:
+        """The timeout of contact_plan as given, or the automatic one [s]."""
+        return self.contact_timeout or (0.1 if self.kind == SHOOTING else 0.5)
 
     @property
     def joint_tolerance(self) -> float:
