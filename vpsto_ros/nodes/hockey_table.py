@@ -57,7 +57,7 @@ class HockeyTableConfig:
         return ObjectState(puck.stamp, pose, twist, covariance)
 
     def puck_state(self, state: ObjectState) -> PuckState:
-        """A puck as planners take it, in the table frame; what it touches is not known."""
+        """A puck as planners take it, in the table frame; what it touches is not known, nor do they ask."""
         columns = np.array([0, 1, 3, 4])
         mean = np.concatenate([self.to_table(state.pose[:2]), state.twist[:2]])
         return PuckState(state.stamp, mean, state.covariance[np.ix_(columns, columns)], 0, "")
