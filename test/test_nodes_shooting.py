@@ -1,7 +1,11 @@
 """The planners with the task shooting: shots from a puck's state, strikes from a contact plan."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("rclpy")
 
@@ -12,6 +16,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from sim_bridge.hockey.table import TABLE_ORIGIN
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
@@ -24,16 +29,18 @@ from vpsto_ros.nodes.conversions import (
     state_message,
     withdrawal_message,
 )
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig, strike_table
+from vpsto_ros.nodes.hockey_table import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
 from vpsto_ros.planning.hockey.shot_preview import preview
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
 from vpsto_ros.trajectory import Trajectory
 
+ROOT = Path(__file__).resolve().parents[1]
 FRAME = "iiwa_link_0"
 HOME = np.array([0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0])
 TABLE = HockeyTableConfig()
@@ -347,9 +354,34 @@ def test_broken_contacts_are_refused_with_a_reason(striker, change, reason):
     assert reason in striker.node.complaints.recent() and striker.node.task.contact is None
 
 
-def test_a_table_that_stands_elsewhere_has_no_strikes():
-    with pytest.raises(ConfigurationError, match=r"1.51"):
-        strike_table(HockeyTableConfig(x=1.4))
+def test_nodes_and_driver_know_one_table():
+    nodes = yaml.safe_load((ROOT / "config" / "air_hockey.yaml").read_text())
+    own = {name: values["ros__parameters"].get("hockey", {}) for name, values in nodes.items()}
+    strikes = StrikeTable.load()
+    tables = [
+        HockeyTableConfig(**own["state_estimator"]),
+        PlayingSurfaceConfig(**own.get("contact_planner", {})).table(strikes),
+        PlayingSurfaceConfig(**own.get("mpc_planner", {})).table(strikes),
+    ]
+    for table in tables:
+        np.testing.assert_allclose([*table.origin, table.surface], TABLE_ORIGIN, atol=1e-9)
+
+
+def test_the_planners_are_where_their_strikes_are(bench, monkeypatch):
+    strikes = StrikeTable.load()
+    moved = dataclasses.replace(strikes, rules=dataclasses.replace(strikes.rules, table_x=1.53, table_y=0.01))
+    monkeypatch.setattr(StrikeTable, "load", lambda *_: moved)
+    made = bench(ContactPlannerNode, "contact_planner")
+    for kind, topic in ((Odometry, "object_state"), (JointState, "joint_states")):
+        made.talk(kind, topic)
+    made.listen(Odometry, "contact_plan")
+    made.connect()
+    made.advance(0.5, each=known(made))
+    last = plans(made)[-1]
+    behind = last.position + MODEL.table.contact_distance * last.velocity / np.linalg.norm(last.velocity)
+    np.testing.assert_allclose(behind, TABLE.to_base([-0.5, 0.0]), atol=2e-3)
+    planner = made.node.task.planner
+    np.testing.assert_allclose(planner.committed.puck[:2], [-0.52, -0.01], atol=2e-3)
 
 
 def test_the_kind_decides_whose_lead_counts():

@@ -4,7 +4,7 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig
+from vpsto_ros.nodes.hockey_table import PlayingSurfaceConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import PUSHING, TASKS, RobotConfig, check_task
 from vpsto_ros.nodes.scene import ModelConfig
@@ -52,7 +52,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     planner: ContactPlannerConfig = dataclasses.field(default_factory=ContactPlannerConfig)
     robust: RobustContactPlannerConfig = dataclasses.field(default_factory=RobustContactPlannerConfig)
     shooting: ShootingConfig = dataclasses.field(default_factory=ShootingConfig)
-    hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
+    hockey: PlayingSurfaceConfig = dataclasses.field(default_factory=PlayingSurfaceConfig)
 
     def __post_init__(self) -> None:
         validate(self)

@@ -4,7 +4,7 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig
+from vpsto_ros.nodes.hockey_table import PlayingSurfaceConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import (
     PUSHING,
@@ -74,7 +74,7 @@ class MpcPlannerConfig(NodeConfig):
     planner: PushingMpcConfig = dataclasses.field(default_factory=PushingMpcConfig)
     robust: RobustMpcConfig = dataclasses.field(default_factory=RobustMpcConfig)
     strike: StrikeMpcConfig = dataclasses.field(default_factory=StrikeMpcConfig)
-    hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
+    hockey: PlayingSurfaceConfig = dataclasses.field(default_factory=PlayingSurfaceConfig)
 
     def __post_init__(self) -> None:
         validate(self)

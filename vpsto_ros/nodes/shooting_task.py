@@ -12,7 +12,7 @@ from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
 from vpsto_ros.nodes.conversions import contact_message, read_state, withdrawal_message
-from vpsto_ros.nodes.hockey_table import MALLET, strike_table
+from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
@@ -20,6 +20,7 @@ from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingPlanner, Shot
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
 from vpsto_ros.planning.hockey.shot_preview import ShotPreview, preview
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 
 SAME_SHOT = 0.02
@@ -33,12 +34,12 @@ class ShootingContacts:
 
     def __init__(self, node: ManagedNode, config: ContactPlannerNodeConfig) -> None:
         """Set up the planner and listen."""
-        self._node, self._config, self._table = node, config, config.hockey
-        shooting = dataclasses.replace(config.shooting, base=tuple(-self._table.origin))
+        strikes = StrikeTable.load()
+        self._node, self._config, self._table = node, config, config.hockey.table(strikes)
+        shooting = config.shooting
         if config.setting != OWN_SETTING:
             shooting = dataclasses.replace(shooting, objective=SETTINGS[config.setting])
         self._model = puck_model(config.puck_model)
-        strikes = strike_table(self._table)
         policy = ShootingPolicy.load(config.setting) if config.policy else None
         self.planner = ShootingPlanner(self._model, strikes, shooting, policy)
         self._warm_up(np.array(strikes.rules.home))

@@ -10,11 +10,12 @@ from visualization_msgs.msg import Marker
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import read_contact, require_frame
-from vpsto_ros.nodes.hockey_table import MALLET, strike_table
+from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.planning.stitching import extended
 from vpsto_ros.robot.iiwa_kinematics import arm_points
@@ -32,8 +33,9 @@ class StrikeTask:
 
     def __init__(self, node: ManagedNode, config: MpcPlannerConfig) -> None:
         """Set up the planner and listen."""
-        self._node, self._config, self._table = node, config, config.hockey
-        self.planner = StrikeMpc(strike_table(self._table), config.strike, seed=config.seed)
+        strikes = StrikeTable.load()
+        self._node, self._config, self._table = node, config, config.hockey.table(strikes)
+        self.planner = StrikeMpc(strikes, config.strike, seed=config.seed)
         self._warm_up()
         self.forget()
         self._refusals = node.advertise(Odometry, "refused_contact", reliable(5))
