@@ -91,7 +91,9 @@ def test_worlds_differ_from_the_nominal_one_within_the_spread():
 def test_settings_are_those_of_the_thesis_and_one_that_must_use_a_rim():
     assert {name: OBJECTIVES[name] for name in SETTINGS} == SETTINGS
     assert OBJECTIVES["forced_bank"].least_banks == 1 and config("moving") == config("conservative")
-    assert set(SCORES) == set(OBJECTIVES)
+    thesis = dataclasses.replace(SETTINGS["aggressive"], beta=0.5)
+    assert OBJECTIVES["aggressive_thesis"] == thesis and thesis.lambda1 == 0.0
+    assert set(SCORES) == set(OBJECTIVES) - {"aggressive_thesis"}, "which is only compared with"
 
 
 def test_the_baseline_prefers_the_middle_of_the_goal_and_no_rims():
@@ -338,7 +340,8 @@ def test_broken_rules_are_named_in_the_verdict():
     summary = summarise(results(violations={"limits": 2, "height": 3}))
     assert summary["constraint_violations"] == 5 * 40 * len(PLAYERS)
     (missed,) = missed_targets(summary)
-    assert "limits 560" in missed and "height 840" in missed
+    shots = 40 * len(PLAYERS)
+    assert f"limits {2 * shots}" in missed and f"height {3 * shots}" in missed
 
 
 def test_the_command_fails_and_says_why(tmp_path, monkeypatch, capsys):
