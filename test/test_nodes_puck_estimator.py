@@ -1,9 +1,11 @@
 """The state estimator with the filter of a puck: what it makes of camera and joints, and what it refuses."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("rclpy")
 
@@ -14,16 +16,18 @@ from node_bench import Bench
 from sensor_msgs.msg import JointState
 
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
-from vpsto_ros.estimation.puck_filter import PuckState
+from vpsto_ros.estimation.puck_filter import PuckFilterConfig, PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.conversions import SIMULATED, observation_message, read_belief, read_state
 from vpsto_ros.nodes.hockey_table import UNKNOWN_YAW, HockeyTableConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message
+from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.nodes.state_estimator import StateEstimator
 from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
 
+ROOT = Path(__file__).resolve().parents[1]
 FRAME = "iiwa_link_0"
 HOME = np.array([0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0])
 NOISE = 5e-7 * np.eye(3) + np.diag([0.0, 0.0, 4e-4])
@@ -50,9 +54,9 @@ def estimator():
     made.close()
 
 
-def see(bench, place, age=0.01, frame=FRAME, height=0.1):
+def see(bench, place, age=0.01, frame=FRAME, height=0.1, noise=NOISE):
     pose = np.append(place, 0.3)
-    bench.send("object_pose", observation_message(pose, NOISE, bench.stamp(-age), frame, height))
+    bench.send("object_pose", observation_message(pose, noise, bench.stamp(-age), frame, height))
 
 
 def measure(bench, q=HOME, qd=None, names=JOINT_NAMES):
@@ -91,6 +95,54 @@ def test_a_sliding_puck_is_predicted_to_the_present_at_its_rate(estimator):
     report = estimator.node.report()
     assert report.level == 0 and report.values["filter"] == "tracking"
     assert report.values["contacts"] == 0
+
+
+def spread_without_a_covariance(std):
+    """Standard deviation [m] after a second frame that gives no covariance."""
+    bench = Bench(StateEstimator, "state_estimator", kind="puck", base_frame=FRAME,
+                  puck__position_std=std, **TABLE)  # fmt: skip
+    bench.talk(PoseWithCovarianceStamped, "object_pose")
+    bench.listen(Odometry, "object_state")
+    bench.connect()
+    bench.advance(0.02, each=lambda _: see(bench, (1.0, 0.0), age=0.0, noise=np.zeros((3, 3))))
+    bench.advance(0.1)
+    known = bench.node.estimator._filter.state(bench.node.estimator.frame_stamp)
+    bench.close()
+    return math.sqrt(known.covariance[0, 0])
+
+
+@pytest.mark.parametrize("std", [0.0007, 0.02])
+def test_frames_without_a_covariance_are_as_good_as_the_filters_options_say(std):
+    assert 0.5 * std < spread_without_a_covariance(std) < 1.01 * std
+
+
+def test_options_that_would_change_nothing_are_refused():
+    with pytest.raises(ConfigurationError, match=r"puck\.velocity_std"):
+        StateEstimatorConfig(kind="puck", puck=PuckFilterConfig(velocity_std=0.1))
+    with pytest.raises(ConfigurationError, match=r"puck\.position_std"):
+        StateEstimatorConfig(kind="puck", position_std=0.001)
+
+
+def test_estimator_and_planner_know_one_mallet():
+    parameters = yaml.safe_load((ROOT / "config" / "air_hockey.yaml").read_text())
+    estimator = parameters["state_estimator"]["ros__parameters"].get("mallet", {})
+    planner = parameters["mpc_planner"]["ros__parameters"].get("strike", {}).get("tilt", {})
+    assert estimator == planner
+    assert StateEstimatorConfig().mallet == MpcPlannerConfig().strike.tilt
+
+
+def test_the_mallet_swings_as_the_parameters_say():
+    places = []
+    for damping in (0.31, 0.0):
+        bench = Bench(StateEstimator, "state_estimator", kind="puck", base_frame=FRAME,
+                      mallet__damping=damping)  # fmt: skip
+        bench.node.estimator.move(0.0, HOME, np.zeros(7))
+        qd = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.3, 0.0])
+        for k in range(1, 6):
+            bench.node.estimator.move(0.01 * k, HOME + 0.01 * k * qd, qd)
+        places.append(bench.node.estimator._mallet.observe(0.05, HOME + 0.05 * qd, qd))
+        bench.close()
+    assert np.abs(places[0][:2] - places[1][:2]).max() > 1e-4
 
 
 def test_a_bounce_is_foreseen_while_the_camera_is_silent(estimator):

@@ -1,9 +1,12 @@
 """The planners with the task shooting: shots from a puck's state, strikes from a contact plan."""
 
 import copy
+import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("rclpy")
 
@@ -14,22 +17,31 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from sim_bridge.hockey.table import TABLE_ORIGIN
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.contact_planner import ContactPlannerNode
 from vpsto_ros.nodes.contact_planner_config import ContactPlannerNodeConfig
-from vpsto_ros.nodes.conversions import SIMULATED, contact_message, read_contact, state_message
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig, strike_table
+from vpsto_ros.nodes.conversions import (
+    SIMULATED,
+    contact_message,
+    read_contact,
+    state_message,
+    withdrawal_message,
+)
+from vpsto_ros.nodes.hockey_table import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
 from vpsto_ros.planning.hockey.shot_preview import preview
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
 from vpsto_ros.trajectory import Trajectory
 
+ROOT = Path(__file__).resolve().parents[1]
 FRAME = "iiwa_link_0"
 HOME = np.array([0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0])
 TABLE = HockeyTableConfig()
@@ -61,7 +73,7 @@ def bench():
 
 @pytest.fixture
 def shooter(bench):
-    made = bench(ContactPlannerNode, "contact_planner", tool_frame="mallet", input_timeout=0.1)
+    made = bench(ContactPlannerNode, "contact_planner", input_timeout=0.1)
     made.talk(Odometry, "object_state")
     made.talk(Odometry, "refused_contact")
     made.talk(JointState, "joint_states")
@@ -90,7 +102,8 @@ def known(bench, place=(-0.5, 0.0)):
 
 
 def plans(bench):
-    return [read_contact(message, SIMULATED, FRAME) for message in bench.received["contact_plan"]]
+    got = bench.received["contact_plan"]
+    return [read_contact(message, SIMULATED, FRAME) for message in got if message.child_frame_id]
 
 
 def test_a_resting_puck_is_shot_at_the_goal_at_one_time(shooter):
@@ -152,6 +165,23 @@ def test_nothing_is_planned_without_puck_or_arm_and_a_far_puck_is_left_alone(sho
     assert not plans(shooter) and shooter.node.report().message.startswith("no shot: ")
 
 
+@pytest.mark.parametrize("loss", ["puck away", "puck silent", "arm silent"])
+def test_a_shot_that_is_dropped_is_called_off_once(shooter, loss):
+    shooter.advance(0.4, each=known(shooter))
+    assert shooter.received["contact_plan"][-1].child_frame_id == "mallet"
+    after = {
+        "puck away": known(shooter, (0.5, 0.0)),
+        "puck silent": lambda _: arm(shooter),
+        "arm silent": lambda _: puck(shooter),
+    }[loss]
+    shooter.advance(0.4, each=after)
+    told = [message.child_frame_id for message in shooter.received["contact_plan"]]
+    first = told.index("")
+    assert set(told[:first]) == {"mallet"} and told[first:] == [""]
+    assert shooter.received["contact_plan"][-1].header.frame_id == FRAME
+    assert shooter.node.task.planner.committed is None
+
+
 @pytest.mark.parametrize(("setting", "weights"), [("aggressive", (0.0, 1.0)), ("own", (3.0, 0.5))])
 def test_settings_choose_the_objective(bench, setting, weights):
     own = {"shooting__objective__lambda1": 3.0, "shooting__objective__lambda2": 0.5}
@@ -161,7 +191,7 @@ def test_settings_choose_the_objective(bench, setting, weights):
 
 
 def test_a_trained_policy_gives_the_angles_if_asked_to(bench):
-    made = bench(ContactPlannerNode, "contact_planner", tool_frame="mallet", policy=True)
+    made = bench(ContactPlannerNode, "contact_planner", policy=True)
     for kind, topic in ((Odometry, "object_state"), (JointState, "joint_states")):
         made.talk(kind, topic)
     made.listen(Odometry, "contact_plan")
@@ -284,6 +314,22 @@ def test_a_shot_that_is_not_told_any_more_is_called_off(striker):
     assert np.abs(trajectory(min(due, trajectory.end_time), 1)).max() < 0.2
 
 
+def test_a_shot_that_is_called_off_is_dropped_within_two_cycles(striker):
+    striker.advance(0.1, each=lambda _: arm(striker))
+    striker.advance(0.2, each=told(striker, striker.time + 1.6))
+    assert striker.node.planner.contact is not None
+    striker.send("contact_plan", withdrawal_message(striker.stamp(), FRAME))
+    striker.advance(0.04, each=lambda _: follow(striker))
+    assert striker.node.planner.contact is None and striker.node.task.contact is None
+    assert not striker.received["refused_contact"]
+
+
+def test_contacts_age_fast_where_they_are_told_in_every_cycle():
+    assert MpcPlannerConfig(kind="shooting", rate=50.0).contact_timeout_in_force == 0.1
+    assert MpcPlannerConfig().contact_timeout_in_force == 0.5
+    assert MpcPlannerConfig(contact_timeout=0.3).contact_timeout_in_force == 0.3
+
+
 def test_an_impossible_contact_is_sent_back(striker):
     striker.advance(0.1, each=lambda _: arm(striker))
     due = striker.time + 1.0
@@ -298,6 +344,7 @@ def test_an_impossible_contact_is_sent_back(striker):
     ("change", "reason"),
     [
         (lambda m: setattr(m.header, "frame_id", "fr3_link0"), "frame 'fr3_link0'"),
+        (lambda m: setattr(m, "child_frame_id", "fr3_tool"), "child_frame_id 'fr3_tool'"),
         (lambda m: setattr(m.pose.pose.position, "x", float("nan")), "finite"),
         (lambda m: setattr(m.twist.twist.linear, "x", 0.0), "moves"),
         (lambda m: setattr(m.header, "stamp", SIMULATED.stamp(0.0)), "over"),
@@ -313,9 +360,34 @@ def test_broken_contacts_are_refused_with_a_reason(striker, change, reason):
     assert reason in striker.node.complaints.recent() and striker.node.task.contact is None
 
 
-def test_a_table_that_stands_elsewhere_has_no_strikes():
-    with pytest.raises(ConfigurationError, match=r"1.51"):
-        strike_table(HockeyTableConfig(x=1.4))
+def test_nodes_and_driver_know_one_table():
+    nodes = yaml.safe_load((ROOT / "config" / "air_hockey.yaml").read_text())
+    own = {name: values["ros__parameters"].get("hockey", {}) for name, values in nodes.items()}
+    strikes = StrikeTable.load()
+    tables = [
+        HockeyTableConfig(**own["state_estimator"]),
+        PlayingSurfaceConfig(**own.get("contact_planner", {})).table(strikes),
+        PlayingSurfaceConfig(**own.get("mpc_planner", {})).table(strikes),
+    ]
+    for table in tables:
+        np.testing.assert_allclose([*table.origin, table.surface], TABLE_ORIGIN, atol=1e-9)
+
+
+def test_the_planners_are_where_their_strikes_are(bench, monkeypatch):
+    strikes = StrikeTable.load()
+    moved = dataclasses.replace(strikes, rules=dataclasses.replace(strikes.rules, table_x=1.53, table_y=0.01))
+    monkeypatch.setattr(StrikeTable, "load", lambda *_: moved)
+    made = bench(ContactPlannerNode, "contact_planner")
+    for kind, topic in ((Odometry, "object_state"), (JointState, "joint_states")):
+        made.talk(kind, topic)
+    made.listen(Odometry, "contact_plan")
+    made.connect()
+    made.advance(0.5, each=known(made))
+    last = plans(made)[-1]
+    behind = last.position + MODEL.table.contact_distance * last.velocity / np.linalg.norm(last.velocity)
+    np.testing.assert_allclose(behind, TABLE.to_base([-0.5, 0.0]), atol=2e-3)
+    planner = made.node.task.planner
+    np.testing.assert_allclose(planner.committed.puck[:2], [-0.52, -0.01], atol=2e-3)
 
 
 def test_the_kind_decides_whose_lead_counts():

@@ -59,6 +59,8 @@ class ContactPlannerNode(ManagedNode):
         missing = self._missing(now)
         if missing:
             self._status = Report(STALE, missing)
+            for message in self.task.withdraw():
+                self._publisher.publish(message)
             return
         with self._compute.measured():
             messages = self.task.plan(now, self.joints)

@@ -4,7 +4,7 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig
+from vpsto_ros.nodes.hockey_table import PlayingSurfaceConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import PUSHING, TASKS, RobotConfig, check_task
 from vpsto_ros.nodes.scene import ModelConfig
@@ -31,7 +31,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
     goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
     tool_frame: str = option(
-        "fr3_tool", "child_frame_id of contact_plan for pushing and shooting; other robots' tools have names"
+        "fr3_tool", "child_frame_id of contact_plan for pushing; the mallet and other tools have names"
     )
     input_timeout: float = option(
         0.5, "planning pauses when joint states, object states or beliefs are older", unit="s", minimum=0.02,
@@ -52,7 +52,7 @@ class ContactPlannerNodeConfig(NodeConfig):
     planner: ContactPlannerConfig = dataclasses.field(default_factory=ContactPlannerConfig)
     robust: RobustContactPlannerConfig = dataclasses.field(default_factory=RobustContactPlannerConfig)
     shooting: ShootingConfig = dataclasses.field(default_factory=ShootingConfig)
-    hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
+    hockey: PlayingSurfaceConfig = dataclasses.field(default_factory=PlayingSurfaceConfig)
 
     def __post_init__(self) -> None:
         validate(self)

@@ -42,6 +42,9 @@ class ContactTask(Protocol):
     def plan(self, now: float, joints: NDArray) -> list[Odometry]:
         """Where each end effector shall touch, given the robot's joint positions (n,) [rad]."""
 
+    def withdraw(self) -> list[Odometry]:
+        """What takes the last plan back when no other can be made; nothing where it stays right."""
+
     def status(self) -> str:
         """What the last plan is, in words; empty where there is nothing to say."""
 
@@ -62,6 +65,10 @@ class OnTable:
     def joint_names(self) -> tuple[str, ...]:
         """Names of the robot's joints."""
         return self._tools.robot.joint_names
+
+    def withdraw(self) -> list[Odometry]:
+        """Nothing: pushing on at the place of the last plan does no harm."""
+        return []
 
     def status(self) -> str:
         """Nothing to say."""

@@ -234,6 +234,11 @@ def contact_message(plan: ContactPlan, time_base: TimeBase, frame: str, tool_fra
     return message
 
 
+def withdrawal_message(stamp: Time, frame: str) -> Odometry:
+    """In place of a contact plan: no tool is to touch anything, and what was asked for before is off."""
+    return Odometry(header=Header(stamp=stamp, frame_id=frame))
+
+
 def read_contact(message: Odometry, time_base: TimeBase, frame: str) -> ContactPlan:
     """A contact plan.
 

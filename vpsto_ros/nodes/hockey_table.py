@@ -8,9 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.puck_filter import PuckState
-from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.planning.hockey.strikes import StrikeTable
+from vpsto_ros.planning.hockey.shooting_config import Strikes
 
+MALLET = "mallet"
+"""Frame of the mallet's centre, with the axes of the base frame: child_frame_id of contact_plan."""
 UNKNOWN_YAW = np.pi**2 / 3.0
 """Variance of the yaw of a puck, which nobody estimates: any is as likely [rad²]."""
 UNKNOWN_SPIN = 1e4
@@ -55,22 +56,25 @@ class HockeyTableConfig:
         return ObjectState(puck.stamp, pose, twist, covariance)
 
     def puck_state(self, state: ObjectState) -> PuckState:
-        """A puck as planners take it, in the table frame; what it touches is not known."""
+        """A puck as planners take it, in the table frame; what it touches is not known, nor do they ask."""
         columns = np.array([0, 1, 3, 4])
         mean = np.concatenate([self.to_table(state.pose[:2]), state.twist[:2]])
         return PuckState(state.stamp, mean, state.covariance[np.ix_(columns, columns)], 0, "")
 
 
-def strike_table(config: HockeyTableConfig) -> StrikeTable:
-    """The strikes that come with the package.
+@documented
+@dataclasses.dataclass(frozen=True)
+class PlayingSurfaceConfig:
+    """How high the table is, for nodes whose strikes say where else it stands."""
 
-    Raises:
-        ConfigurationError: they are for a table that stands elsewhere.
-    """
-    strikes = StrikeTable.load()
-    if not np.allclose(strikes.rules.table, config.origin, atol=1e-6):
-        raise ConfigurationError(
-            f"hockey.x, hockey.y = {config.x:g}, {config.y:g}: the strikes of the arm are tabulated for a "
-            f"table at {strikes.rules.table_x:g}, {strikes.rules.table_y:g} m"
-        )
-    return strikes
+    surface: float = option(
+        0.1, "height of the playing surface, base frame", unit="m", minimum=-2.0, maximum=2.0
+    )
+
+    def __post_init__(self) -> None:
+        validate(self)
+
+    def table(self, strikes: Strikes) -> HockeyTableConfig:
+        """The table that strikes are for."""
+        x, y = map(float, strikes.center)
+        return HockeyTableConfig(x, y, self.surface)

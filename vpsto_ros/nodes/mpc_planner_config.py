@@ -4,7 +4,7 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig
+from vpsto_ros.nodes.hockey_table import PlayingSurfaceConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import (
     PUSHING,
@@ -58,7 +58,12 @@ class MpcPlannerConfig(NodeConfig):
         0.1, "nothing is published when joint_states are older", unit="s", minimum=0.02, maximum=10.0
     )
     contact_timeout: float = option(
-        0.5, "a contact_plan received longer ago is not used", unit="s", minimum=0.02, maximum=10.0
+        0.0,
+        "a contact_plan received longer ago is not used; 0 takes 0.1 s for shooting, where it comes anew in "
+        "every cycle, and 0.5 s else",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
     )
     goal_orientation: str = option("ignore", "whether the yaw of goal_pose counts", choices=("ignore", "use"))
     marker_rate: float = option(10.0, "rate of ~/markers", unit="Hz", minimum=0.1, maximum=50.0)
@@ -69,7 +74,7 @@ class MpcPlannerConfig(NodeConfig):
     planner: PushingMpcConfig = dataclasses.field(default_factory=PushingMpcConfig)
     robust: RobustMpcConfig = dataclasses.field(default_factory=RobustMpcConfig)
     strike: StrikeMpcConfig = dataclasses.field(default_factory=StrikeMpcConfig)
-    hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
+    hockey: PlayingSurfaceConfig = dataclasses.field(default_factory=PlayingSurfaceConfig)
 
     def __post_init__(self) -> None:
         validate(self)
@@ -101,6 +106,11 @@ class MpcPlannerConfig(NodeConfig):
     def lead(self) -> float:
         """Time between the start of planning and the moment a plan takes over [s]."""
         return getattr(self, self._group).lead
+
+    @property
+    def contact_timeout_in_force(self) -> float:
+        """The timeout of contact_plan as given, or the automatic one [s]."""
+        return self.contact_timeout or (0.1 if self.kind == SHOOTING else 0.5)
 
     @property
     def joint_tolerance(self) -> float:

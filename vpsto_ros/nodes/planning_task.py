@@ -97,7 +97,7 @@ class PushingTask(OnTable):
     def step(self, now: float, position: NDArray, velocity: NDArray, deadline: float) -> MpcStep:
         """Plan once."""
         contact = self.contact
-        fresh = contact is not None and now - contact[0] <= self._config.contact_timeout
+        fresh = contact is not None and now - contact[0] <= self._config.contact_timeout_in_force
         inputs = (now, position, velocity, self.object, self.goal.latest, contact[1] if fresh else None)
         return self.planner.step(*inputs, deadline=deadline)
 

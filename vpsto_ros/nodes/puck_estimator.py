@@ -19,6 +19,7 @@ from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.mallet_observer import MalletObserver
+from vpsto_ros.robot.mallet_tilt import MalletTilt
 
 
 def puck_model(path: str) -> PuckModel:
@@ -36,12 +37,12 @@ class PuckEstimator:
     with_frames = False
 
     def __init__(
-        self, model: PuckModel, config: PuckFilterConfig, table: HockeyTableConfig, bridging: Bridging,
-        rng: np.random.Generator,
+        self, model: PuckModel, config: PuckFilterConfig, mallet: MalletTilt, table: HockeyTableConfig,
+        bridging: Bridging, rng: np.random.Generator,
     ) -> None:  # fmt: skip
-        """Compile the filter."""
+        """Compile the filter; `mallet` is how the mallet swings."""
         self._filter, self._table, self._bridging, self._rng = PuckFilter(model, config), table, bridging, rng
-        self._mallet = MalletObserver()
+        self._mallet = MalletObserver(mallet)
         self._warm_up()
         self.reset()
 

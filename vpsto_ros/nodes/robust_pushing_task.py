@@ -44,7 +44,7 @@ class RobustPushingTask(OnTable):
 
     def step(self, now: float, position: NDArray, velocity: NDArray, deadline: float) -> MpcStep:
         """Plan once."""
-        contact = self.contact.fresh(now, self._config.contact_timeout)
+        contact = self.contact.fresh(now, self._config.contact_timeout_in_force)
         inputs = (now, position, velocity, self.belief.latest, self.goal.target, contact)
         return self.planner.step(*inputs, deadline=deadline)
 

@@ -11,8 +11,8 @@ from visualization_msgs.msg import Marker
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
-from vpsto_ros.nodes.conversions import contact_message, read_contact, read_state
-from vpsto_ros.nodes.hockey_table import strike_table
+from vpsto_ros.nodes.conversions import contact_message, read_contact, read_state, withdrawal_message
+from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
@@ -20,6 +20,7 @@ from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingPlanner, Shot
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
 from vpsto_ros.planning.hockey.shot_preview import ShotPreview, preview
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.hockey.touch import same_touch
 from vpsto_ros.robot.iiwa import iiwa14
 
@@ -32,12 +33,12 @@ class ShootingContacts:
 
     def __init__(self, node: ManagedNode, config: ContactPlannerNodeConfig) -> None:
         """Set up the planner and listen."""
-        self._node, self._config, self._table = node, config, config.hockey
-        shooting = dataclasses.replace(config.shooting, base=tuple(-self._table.origin))
+        strikes = StrikeTable.load()
+        self._node, self._config, self._table = node, config, config.hockey.table(strikes)
+        shooting = config.shooting
         if config.setting != OWN_SETTING:
             shooting = dataclasses.replace(shooting, objective=SETTINGS[config.setting])
         self._model = puck_model(config.puck_model)
-        strikes = strike_table(self._table)
         policy = ShootingPolicy.load(config.setting) if config.policy else None
         self.planner = ShootingPlanner(self._model, strikes, shooting, policy)
         self._warm_up(np.array(strikes.rules.home))
@@ -59,26 +60,38 @@ class ShootingContacts:
     def forget(self) -> None:
         """Forget puck and shot."""
         self.puck: PuckState | None = None
+        self._told = False  # whether contact_plan says that there is a shot
         self.planner.forget()
 
     def missing(self, now: float, limit: float) -> str:
         """What keeps it from planning."""
         if self.puck is None or now - self.puck.stamp > limit:
-            self.planner.forget()
             return f"no object_state within {limit} s"
         return ""
 
     def plan(self, now: float, joints: NDArray) -> list[Odometry]:
-        """Where, when and how fast the mallet shall touch; nothing while there is no shot."""
+        """Where, when and how fast the mallet shall touch; once that it shall not when a shot is dropped."""
         assert self.puck is not None, "`missing` says so"
         shot = self.planner.plan(now, self.puck, joints)
         if shot is None:
-            return []
+            return self._no_shot()
+        self._told = True
         self._chances.publish(Float64(data=shot.goal))
         covariance = self._seen(shot).at_touch[:2, :2] + _LEAST_VARIANCE * np.eye(2)
         place, frame = self._table.to_base(shot.mallet[:2]), self._config.base_frame
         touch = ContactPlan(shot.time, place, shot.mallet[2:], covariance)
-        return [contact_message(touch, self._node.time_base, frame, self._config.tool_frame)]
+        return [contact_message(touch, self._node.time_base, frame, MALLET)]
+
+    def withdraw(self) -> list[Odometry]:
+        """Drop the shot, and say so: without puck or arm it would not follow the puck any more."""
+        self.planner.forget()
+        return self._no_shot()
+
+    def _no_shot(self) -> list[Odometry]:
+        """What calls off the shot that was told last; nothing if that was done."""
+        told, self._told = self._told, False
+        stamp = self._node.get_clock().now().to_msg()
+        return [withdrawal_message(stamp, self._config.base_frame)] if told else []
 
     def status(self) -> str:
         """What is intended, or why nothing is."""

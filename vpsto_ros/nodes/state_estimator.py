@@ -35,9 +35,8 @@ class StateEstimator(ManagedNode):
     def configure(self, config: StateEstimatorConfig) -> None:
         """Set up filter, topics and timers."""
         self.config = config
-        self._default_covariance = np.diag(
-            [config.position_std**2, config.position_std**2, config.yaw_std**2]
-        )
+        std = config.puck.position_std if config.kind == PUCK else config.position_std
+        self._default_covariance = np.diag([std**2, std**2, config.yaw_std**2])
         self._update_time, self._rate = Durations(), Rate()
         self.reinitialized = 0
         self.estimator = self._make_estimator(config)
@@ -57,7 +56,7 @@ class StateEstimator(ManagedNode):
             return KalmanEstimator(config.filter, bridging, rng)
         if config.kind == PUCK:
             model = puck_model(config.puck_model)
-            puck = PuckEstimator(model, config.puck, config.hockey, bridging, rng)
+            puck = PuckEstimator(model, config.puck, config.mallet, config.hockey, bridging, rng)
             puck.listen(self)
             return puck
         dynamics = belief_dynamics(config.robot, config.model, config.way_variance)

@@ -12,6 +12,7 @@ from vpsto_ros.nodes.hockey_table import HockeyTableConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import RobotConfig
 from vpsto_ros.nodes.scene import ModelConfig, TableConfig
+from vpsto_ros.robot.mallet_tilt import MalletTilt
 
 KALMAN, PARTICLES, PUCK = "kalman", "particles", "puck"
 
@@ -25,7 +26,8 @@ class StateEstimatorConfig(NodeConfig):
         KALMAN,
         "which filter: kalman, which knows the camera only (filter.*); particles that the robot's tools push "
         "(particles.*, robot.*, model.*, way_variance, touch), which need joint_states; or that of an "
-        "air-hockey puck (puck.*, puck_model, hockey.*), which the mallet of an iiwa hits: joint_states",
+        "air-hockey puck (puck.*, puck_model, mallet.*, hockey.*), which the mallet of an iiwa hits: "
+        "joint_states",
         choices=(KALMAN, PARTICLES, PUCK),
     )
     rate: float = option(50.0, "rate at which object_state is kept up", unit="Hz", minimum=1.0, maximum=200.0)
@@ -62,7 +64,11 @@ class StateEstimatorConfig(NodeConfig):
         maximum=10.0,
     )
     position_std: float = option(
-        0.005, "standard deviation of x and y where a frame gives none", unit="m", minimum=1e-5, maximum=1.0
+        0.005,
+        "standard deviation of x and y where a frame gives none; for a puck puck.position_std counts",
+        unit="m",
+        minimum=1e-5,
+        maximum=1.0,
     )
     yaw_std: float = option(
         0.05, "standard deviation of yaw where a frame gives none", unit="rad", minimum=1e-5, maximum=3.0
@@ -90,6 +96,7 @@ class StateEstimatorConfig(NodeConfig):
     robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
     puck: PuckFilterConfig = dataclasses.field(default_factory=PuckFilterConfig)
+    mallet: MalletTilt = dataclasses.field(default_factory=MalletTilt)
     hockey: HockeyTableConfig = dataclasses.field(default_factory=HockeyTableConfig)
 
     @property
@@ -107,6 +114,16 @@ class StateEstimatorConfig(NodeConfig):
         if self.touch and self.kind != PARTICLES:
             raise ConfigurationError(
                 f"touch = True needs kind = '{PARTICLES}'; the other filters know nothing of forces"
+            )
+        if self.puck.velocity_std != PuckFilterConfig().velocity_std:
+            raise ConfigurationError(
+                f"puck.velocity_std = {self.puck.velocity_std:g} would change nothing: object_pose brings no "
+                "velocities; leave it out"
+            )
+        if self.kind == PUCK and self.position_std != StateEstimatorConfig.position_std:
+            raise ConfigurationError(
+                f"position_std = {self.position_std:g} would change nothing with kind = '{PUCK}'; set "
+                "puck.position_std"
             )
         if self.kind == PARTICLES and self.belief_samples < 2:
             raise ConfigurationError(

@@ -9,12 +9,13 @@ from visualization_msgs.msg import Marker
 
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes import markers
-from vpsto_ros.nodes.conversions import read_contact
-from vpsto_ros.nodes.hockey_table import strike_table
+from vpsto_ros.nodes.conversions import read_contact, require_frame
+from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.planning.stitching import extended
 from vpsto_ros.robot.iiwa_kinematics import arm_points
@@ -26,13 +27,15 @@ _LATE = 0.2  # a contact that was due longer ago was meant for another clock [s]
 class StrikeTask:
     """The mallet of an iiwa strikes where, when and as fast as contact_plan says, and waits at home else.
 
-    A contact that no motion leads to goes back on the topic refused_contact, as it came.
+    A contact_plan of no frame (its child_frame_id is empty) calls off what was told before. A contact that no
+    motion leads to goes back on the topic refused_contact, as it came.
     """
 
     def __init__(self, node: ManagedNode, config: MpcPlannerConfig) -> None:
         """Set up the planner and listen."""
-        self._node, self._config, self._table = node, config, config.hockey
-        self.planner = StrikeMpc(strike_table(self._table), config.strike, seed=config.seed)
+        strikes = StrikeTable.load()
+        self._node, self._config, self._table = node, config, config.hockey.table(strikes)
+        self.planner = StrikeMpc(strikes, config.strike, seed=config.seed)
         self._warm_up()
         self.forget()
         self._refusals = node.advertise(Odometry, "refused_contact", reliable(5))
@@ -54,7 +57,7 @@ class StrikeTask:
 
     def step(self, now: float, position: NDArray, velocity: NDArray, deadline: float) -> MpcStep:
         """Plan once; the search has a fixed number of iterations, which fits a cycle."""
-        fresh = now - self._received <= self._config.contact_timeout
+        fresh = now - self._received <= self._config.contact_timeout_in_force
         contact = self.contact if fresh else None
         step = self.planner.step(now, position, velocity, contact)
         if contact is not None and step.refused:
@@ -78,6 +81,15 @@ class StrikeTask:
         return []
 
     def _receive(self, message: Odometry) -> None:
+        if not message.child_frame_id:
+            require_frame(message.header, self._config.base_frame)
+            self.forget()
+            return
+        if message.child_frame_id != MALLET:
+            raise InvalidInputError(
+                f"child_frame_id '{message.child_frame_id}'; expected '{MALLET}', or an empty one to call a "
+                "shot off"
+            )
         due = self._node.seconds(message.header.stamp, CONTACT_AHEAD)
         if due < self._node.clock_seconds() - _LATE:
             raise InvalidInputError("the contact is over")

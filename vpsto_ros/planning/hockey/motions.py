@@ -81,7 +81,10 @@ class PlayMotion:
         begin, end: its two states; the time of the end counts only if it is given.
     """
 
-    def __init__(self, play: Play, begin: ArmState, end: ArmState, guess: NDArray, last: float = 0.0) -> None:
+    def __init__(
+        self, play: Play, begin: ArmState, end: ArmState, guess: NDArray, last: float = 0.0,
+        hint: NDArray | None = None,
+    ) -> None:  # fmt: skip
         """Pose the problem.
 
         Args:
@@ -90,9 +93,10 @@ class PlayMotion:
             end: state at the end, to be reached at its time; as soon as the limits allow if that is infinite.
             guess: a position on the way, shape (7,) [rad]: where the run-up begins, or where a brake ends.
             last: for how long before the end there shall be no via-point, 0: evenly spaced ones [s].
+            hint: via-points (N, 7) of an earlier search that came close, to look at first.
         """
         self.play, self.begin, self.end, self.start_time = play, begin, end, begin.time
-        self._guess, self._last = guess, last
+        self._guess, self._last, self._hint = guess, last, hint
         self._bases: dict[int, OptimalBasis] = {}
         self._priors: dict[int, GaussianPrior] = {}
 
@@ -164,13 +168,16 @@ class PlayMotion:
         return self._priors[n_via]
 
     def guesses(self, n_via: int) -> NDArray[np.float64]:
-        """Straight to the guess and on from there, and the mean of the prior, (2, N, 7)."""
+        """Straight to the guess and on from there, the mean of the prior, and the hint, (S, N, 7)."""
         share = np.arange(1, n_via + 1)[:, None] / n_via
         if self.timed:
             way = self.begin.position + share * (self._guess - self.begin.position)
         else:
             way = self._guess + (share - 1.0 / n_via) * (self.end.position - self._guess)
-        return np.stack([way, self.prior(n_via).mean_points])
+        found = [way, self.prior(n_via).mean_points]
+        if self._hint is not None and len(self._hint) == n_via:
+            found.append(self._hint)
+        return np.stack(found)
 
 
 _RAISED = 0.12  # by how much the universal joint is raised to get over what stands on the table [m]

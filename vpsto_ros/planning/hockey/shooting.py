@@ -155,8 +155,6 @@ class ShootingPlanner:
             return f"the puck's state is {now - puck.stamp:.2f} s old"
         if self._times.off_table(puck.mean[None])[0]:
             return "the puck has left the table"
-        if puck.touching == "mallet":
-            return "the mallet touches the puck"
         return ""
 
     def _follow(self, shot: Shot, now: float, puck: PuckState) -> str:

@@ -19,6 +19,10 @@ class Strikes(Protocol):
     """What the arm can do: largest speeds (5.13) of the mallet along its motion, and the time they need."""
 
     @property
+    def center(self) -> NDArray[np.float64]:
+        """Where the table's centre is, in the robot's base frame, shape (2,) [m]."""
+
+    @property
     def x(self) -> NDArray[np.float64]:
         """Uniform grid of the puck's place at the touch, table frame [m]."""
 
@@ -223,9 +227,6 @@ class ShootingConfig:
     )
     policy_steps: int = option(
         10, "steps of Algorithm 2 for a contact time, where a policy is used", minimum=1, maximum=200
-    )
-    base: tuple[float, float] = option(
-        (-1.51, 0.0), "the robot's base in the table frame", unit="m", minimum=-10.0, maximum=10.0
     )
 
     def __post_init__(self) -> None:

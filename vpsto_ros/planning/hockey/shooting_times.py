@@ -156,7 +156,7 @@ class ContactTimes:
         puck = np.repeat(means[:, :2], shape[1], axis=0)
         angles = np.tile(self.search.angles, shape[0])
         fits, speeds = self.search.fits(puck, angles), self.search.strikes.speeds(puck, angles)
-        mallet = iiwa14().forward(joints)[0][:2] + np.array(self.search.config.base)
+        mallet = iiwa14().forward(joints)[0][:2] - self.search.strikes.center
         direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         behind = ((puck - mallet) * direction).sum(axis=1) > 0.0
         there, objection = _narrowed(

@@ -80,6 +80,10 @@ class StrikeMpcConfig:
             n_via=3, stop_duration=0.0, warm_sigma=0.2, search=VpstoConfig(population=12, iterations=2)
         )
     )
+    attempts: int = option(
+        4, "cycles in which a motion into a new contact is searched before it is refused", minimum=1,
+        maximum=100,
+    )  # fmt: skip
     first_iterations: int = option(
         8, "iterations of a search that has nothing to start from", minimum=1, maximum=1000
     )
@@ -169,6 +173,7 @@ class StrikeMpc(ReferencePlanner):
         self._usual = {online: online.config for online in self._first}
         self._swing: tuple[float, NDArray] | None = None
         self._planned: _Planned | None = None
+        self._hint: NDArray | None = None
         self.forget_plan()
 
     def forget_plan(self) -> None:
@@ -176,6 +181,8 @@ class StrikeMpc(ReferencePlanner):
         self.contact: MalletContact | None = None
         self._cell: Cell | None = None
         self._planned = None
+        self._tried: MalletContact | None = None
+        self._attempts, self._hint = 0, None
         self._approach.accept(None)
         self._return.accept(None)
 
@@ -297,6 +304,9 @@ class StrikeMpc(ReferencePlanner):
     def _strike(self, now: float, takeover: float, contact: MalletContact) -> MpcStep:
         """Plan into the touch, on, and home."""
         fresh = not contact.continues(self.contact)
+        if not contact.continues(self._tried):
+            self._attempts, self._hint = 0, None
+        self._tried = contact
         cell = self._cell
         if fresh or cell is None:
             cell = self.table.cell(contact.mallet, self._running(now))
@@ -341,8 +351,11 @@ class StrikeMpc(ReferencePlanner):
         """
         target = self._target(cell, contact, now, motion)
         run_up, duration = self.table.start(cell), self.table.config.run_up
-        result = self._plan(self._approach, PlayMotion(self.play, begin, target, run_up, duration))
+        result = self._plan(
+            self._approach, PlayMotion(self.play, begin, target, run_up, duration, self._hint)
+        )
         if result.trajectory is None:
+            self._hint = None if result.search is None else result.search.best_any_points
             raise InfeasibleError("no motion into this contact keeps limits and rules")
         onwards = self._follow_through(target)
         self._approach.accept(result.trajectory)
@@ -351,6 +364,9 @@ class StrikeMpc(ReferencePlanner):
     def _refuse(self, now: float, why: str, fresh: bool) -> MpcStep:
         """Go on with what runs: it is whole, and ends at home. If it leads into this contact, all is well."""
         step = self._go_on(now)
+        self._attempts += 1
+        if fresh and self._attempts < self.config.attempts:
+            return dataclasses.replace(step, valid=False, message=f"still searching: {why}")
         if not fresh:
             return dataclasses.replace(step, warning=f"the last plan for this contact goes on: {why}")
         return dataclasses.replace(step, valid=False, message=why, refused=True)

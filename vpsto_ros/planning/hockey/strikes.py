@@ -122,6 +122,11 @@ class StrikeTable:
         """x, y and angle."""
         return self.x, self.y, self.angle
 
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Where the table's centre is, in the robot's base frame, shape (2,) [m]."""
+        return self.rules.table
+
     def speeds(self, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
         """Largest mallet speeds (B,) [m/s] for pucks (B, 2) and angles (B,); 0 where there is no strike.
 
