@@ -118,12 +118,15 @@ class MpcPlannerConfig(NodeConfig):
         return getattr(self, self._group).joint_tolerance
 
     @property
-    def search(self) -> tuple[str, VpstoConfig]:
-        """Name and options of the search that plans."""
+    def searches(self) -> dict[str, VpstoConfig]:
+        """Options of the searches that plan, by their names."""
         return {
-            PUSHING: ("planner.online.search", self.planner.online.search),
-            ROBUST_PUSHING: ("robust.planning.search", self.robust.planning.search),
-            SHOOTING: ("strike.approach.search", self.strike.approach.search),
+            PUSHING: {"planner.online.search": self.planner.online.search},
+            ROBUST_PUSHING: {"robust.planning.search": self.robust.planning.search},
+            SHOOTING: {
+                "strike.approach.search": self.strike.approach.search,
+                "strike.home.search": self.strike.home.search,
+            },
         }[self.kind]
 
     @property
