@@ -48,8 +48,8 @@ class Arm:
         steps: what was planned, in order.
     """
 
-    def __init__(self, seed=0, joints=HOME, at=10.0):
-        self.mpc, self.now, self.steps = StrikeMpc(TABLE, seed=seed), at, []
+    def __init__(self, seed=0, joints=HOME, at=10.0, config=None):
+        self.mpc, self.now, self.steps = StrikeMpc(TABLE, config, seed=seed), at, []
         self.joints = np.array(joints, dtype=float)
 
     def state(self):
@@ -114,18 +114,28 @@ def assert_joined(steps):
             np.testing.assert_allclose(after.trajectory(t, 1), before.trajectory(t, 1), atol=1e-5)
 
 
+def swing_at(arm, time):
+    """Tilt and rates (4,) of the mallet, from what was carried out."""
+    tilt, state = arm.mpc.config.tilt, np.zeros(4)
+    for (begin, motion), end in zip(arm.steps, [*(t for t, _ in arm.steps[1:]), np.inf], strict=True):
+        if begin < time:
+            state = tilt.along(motion.trajectory, min(end, time), begin, state)
+    return state
+
+
 def mallet_at(arm, contact):
-    """State (4,) of the mallet at the touch, table frame, from what was carried out and its swing."""
+    """State (4,) of the mallet at the touch, table frame, from what was carried out and its swing.
+
+    Its place is where its axis is at the height at which it touches.
+    """
     times, rows = arm.executed()
     # The whole of what ran before the touch is one trajectory: the last one planned before it and its past.
     reference = next(step.trajectory for begin, step in reversed(arm.steps) if begin <= contact.time - 0.06)
     q, qd, _ = reference.state(contact.time)
     np.testing.assert_allclose(rows[np.searchsorted(times, contact.time - 5e-4)], q, atol=2e-3)
-    tilt, state = arm.mpc.config.tilt, np.zeros(4)
-    for (begin, motion), end in zip(arm.steps, [*(t for t, _ in arm.steps[1:]), np.inf], strict=True):
-        if begin < contact.time:
-            state = tilt.along(motion.trajectory, min(end, contact.time), begin, state)
-    aside, rate = tilt.displacement(state)
+    tilt, state = arm.mpc.config.tilt, swing_at(arm, contact.time)
+    along = contact.mallet[2:] / np.hypot(*contact.mallet[2:])
+    aside, rate = tilt.touching(state, along), tilt.displacement(state)[1]
     velocity = ROBOT.jacobian(q)[:2] @ qd
     return np.concatenate([ROBOT.forward(q)[0][:2] + aside - RULES.table, velocity + rate])
 
@@ -154,12 +164,54 @@ def test_every_trajectory_keeps_the_rules_and_ends_at_rest_at_home(where):
     np.testing.assert_allclose(last.trajectory(arm.now), HOME, atol=1e-3)
 
 
-def test_the_speed_of_the_touch_is_kept_while_it_lasts():
-    arm, contact = Arm(), contact_at(11.4)
+def struck(contact, arm=None):
+    """A strike, and the trajectory of its touch."""
+    arm = arm or Arm()
     arm.strike(contact)
-    trajectory = next(step.trajectory for begin, step in reversed(arm.steps) if begin <= contact.time - 0.06)
-    at = contact.time + np.array([0.0, 0.015, 0.03, 0.044])
-    np.testing.assert_allclose(trajectory(at, 1), np.tile(trajectory(contact.time, 1), (4, 1)), atol=1e-9)
+    return arm, next(step.trajectory for t, step in reversed(arm.steps) if t <= contact.time - 0.06)
+
+
+@pytest.mark.parametrize("where", CONTACTS, ids=str)
+def test_while_the_touch_lasts_the_joint_goes_straight_on_at_its_speed(where):
+    contact = contact_at(11.4, *where, share=0.7)
+    _, trajectory = struck(contact)
+    at = contact.time + np.linspace(0.0, 0.044, 12)
+    places, velocity = arm_points(trajectory(at))[:, 3], ROBOT.jacobian(trajectory(contact.time))[:3]
+    velocity = velocity @ trajectory(contact.time, 1)
+    even = places[0] + (at - contact.time)[:, None] * velocity
+    assert np.abs(velocity[2]) < 1e-6
+    np.testing.assert_allclose(places, even, atol=4e-4)
+    np.testing.assert_allclose(places[:5], even[:5], atol=5e-5)
+
+
+def test_the_mallet_moves_as_asked_for_in_the_middle_of_the_contact():
+    """It swings on: its velocity is right when half of the contact is over, its place at the touch."""
+    contact, errors = contact_at(11.4, -0.6, 0.2, -45.0), {}
+    for middle in (0.0, 0.009):
+        arm, trajectory = struck(contact, Arm(config=StrikeMpcConfig(middle=middle)))
+        tilt = arm.mpc.config.tilt
+        for after in (0.0, 0.009):
+            state = swing_at(arm, contact.time)
+            state = tilt.along(trajectory, contact.time + after, contact.time, state)
+            q, qd, _ = trajectory.state(contact.time + after)
+            velocity = (ROBOT.jacobian(q) @ qd)[:2] + tilt.displacement(state)[1]
+            errors[middle, after] = np.linalg.norm(velocity - contact.mallet[2:])
+    assert errors[0.009, 0.009] < 0.25 * errors[0.0, 0.009]
+    assert errors[0.0, 0.0] < 0.25 * errors[0.009, 0.0]
+
+
+def test_a_mallet_that_can_almost_be_so_fast_is_a_little_slower():
+    """Up to a tenth; beyond that the contact is refused, with how much could be had."""
+    fast = contact_at(11.4, share=1.05)
+    arm, trajectory = struck(fast)
+    assert all(step.valid for _, step in arm.steps)
+    speed = np.linalg.norm((ROBOT.jacobian(trajectory(fast.time)) @ trajectory(fast.time, 1))[:2])
+    assert 0.85 < speed / np.hypot(*fast.mallet[2:]) < 1.0
+    assert_rules(trajectory)
+    strict = Arm(config=StrikeMpcConfig(slower=0.0))
+    strict.run(10.04)
+    step = strict.cycle(contact_at(11.4, share=1.12))
+    assert not step.valid and "cannot be that fast" in step.message and "%" in step.message
 
 
 def test_a_contact_that_is_told_anew_by_millimetres_does_not_make_it_thrash():
@@ -207,7 +259,7 @@ def test_shortly_before_the_touch_nothing_is_called_off():
 
 def test_another_contact_later_takes_over():
     arm = Arm()
-    arm.run(10.6, contact_at(11.4, -0.5, 0.1, 0.0))
+    arm.run(10.4, contact_at(11.4, -0.5, 0.1, 0.0))
     other = contact_at(11.7, -0.45, -0.1, 20.0)
     arm.strike(other)
     np.testing.assert_allclose(mallet_at(arm, other)[:2], other.mallet[:2], atol=1e-3)

@@ -12,6 +12,7 @@ from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.planning.hockey.strikes import SHIPPED, StrikeConfig, StrikeTable, tabulate
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
+from vpsto_ros.trajectory import Trajectory
 
 HOME = np.array(PlayRules().home)
 MIRROR = np.array([-1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
@@ -28,7 +29,7 @@ def shipped():
 def small():
     """A table that is searched here."""
     grids = [-0.6, -0.4], [-0.2, 0.0, 0.2], np.deg2rad([-40.0, 0.0, 40.0])
-    config = StrikeConfig(lead_weights=(0.5, 1.0, 3.0))
+    config = StrikeConfig(lead_weights=(0.1, 0.5, 1.0, 3.0))
     return tabulate(*grids, 0.0798, np.random.default_rng(1010), config=config, effort=800)
 
 
@@ -76,8 +77,10 @@ def test_whole_strikes_keep_limits_plane_and_places(which, request):
     lower, upper = limits.position_range
     for cell in entries(table, 80, 1011):
         q, qd = strike(table, cell)
-        # What the search leaves of the velocity limit is for what it does not see between its samples.
-        assert np.all(np.abs(qd) <= limits.velocity), cell
+        # The search looks at nine instants, and none is the end of the hold, where joints may be 2 % faster;
+        # planning leaves 3 % of what the rules allow.
+        assert np.all(np.abs(qd) <= 1.02 * limits.velocity), cell
+        assert np.all(np.abs(qd) <= 0.95 * ROBOT.limits.velocity), cell
         assert np.all(np.abs(np.diff(qd, axis=0)) <= 1.05e-3 * limits.acceleration), cell
         assert np.all((q > lower) & (q < upper)), cell
         points = arm_points(q)
@@ -99,6 +102,51 @@ def test_strikes_run_straight_through_the_touch(shipped):
         assert np.abs(off).max() < 0.02, cell
         first = round(1000.0 * shipped.config.run_up)
         assert np.abs(off[first : first + 20]).max() < 1e-3, cell
+
+
+def deviations(table, cell, times, motion):
+    """How far the universal joint is off its even way, in mm: aside, along and up, each the largest."""
+    along = wanted(table, cell)[1]
+    way = arm_points(motion(times))[:, 3] - arm_points(table.posture[cell][None])[0, 3]
+    off = way[:, :2] @ [-along[1], along[0]], way[:, :2] @ along - table.speed[cell] * times, way[:, 2]
+    return [1e3 * np.abs(row).max() for row in off]
+
+
+def test_after_the_touch_the_mallet_goes_straight_on_evenly(shipped):
+    """At full speed, for the 18 ms of a contact and for as long as it is followed through."""
+    hold, straight, bent, touched = shipped.config.hold, [], [], []
+    for cell in entries(shipped, 150, 1062):
+        q, qd = shipped.posture[cell], shipped.rates[cell]
+        after, rates = shipped.straight_on(q, qd, hold)
+        on = Trajectory.from_points([0.0, hold], np.stack([q, after]), np.stack([qd, rates]))
+        times = np.linspace(0.0, hold, 46)
+        straight.append(deviations(shipped, cell, times, on))
+        touched.append(deviations(shipped, cell, times[times < 0.0185], on))
+        bent.append(deviations(shipped, cell, times, lambda t, q=q, qd=qd: q + t[:, None] * qd))
+    straight, bent, touched = np.array(straight), np.array(bent), np.array(touched)
+    assert touched[:, 0].max() < 0.1 and touched.max() < 0.2
+    assert np.median(straight[:, 0]) < 0.12 and straight[:, 0].max() < 0.4
+    assert straight.max() < 1.3
+    # With even joint velocities it turns off by some degrees.
+    assert np.median(bent[:, 0]) > 10.0 * np.median(straight[:, 0]) and bent[:, 0].max() > 5.0
+    assert np.mean(straight[:, 0] < bent[:, 0]) > 0.95
+
+
+def test_straight_on_for_no_time_is_the_touch_itself(shipped):
+    cell = entries(shipped, 1, 1063)[0]
+    after, rates = shipped.straight_on(shipped.posture[cell], shipped.rates[cell], 0.0)
+    np.testing.assert_array_equal(after, shipped.posture[cell])
+    np.testing.assert_array_equal(rates, shipped.rates[cell])
+
+
+def test_straight_on_is_curved_by_the_least_joint_acceleration(shipped):
+    for cell in entries(shipped, 20, 1064):
+        q, qd = shipped.posture[cell], shipped.rates[cell]
+        after, rates = shipped.straight_on(q, qd, 0.02)
+        bend = curvature(q, qd)
+        # The library's difference is one-sided, over 10 ms.
+        assert np.linalg.norm((rates - qd) / 0.02 - bend) < 0.05 * np.linalg.norm(bend) + 0.1, cell
+        np.testing.assert_allclose(after, q + 0.01 * (qd + rates), atol=1e-12)
 
 
 @pytest.mark.parametrize("which", ["shipped", "small"])

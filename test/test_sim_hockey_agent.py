@@ -1,17 +1,20 @@
 """The agent at the simulated table: the mallet swings as it thinks, and a shot scores."""
 
+import math
+
 import numpy as np
 import pytest
 
 from sim_bridge.hockey import table
 from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand
+from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.planning.hockey.agent import HockeyAgent, Observation, PuckSighting
 from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
 from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import JOINT_NAMES
 
-TABLE = StrikeTable.load()
+TABLE, MODEL = StrikeTable.load(), PuckModel.load(SHIPPED)
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +70,33 @@ def test_a_puck_at_rest_is_shot_into_the_goal(world):
         assert world.limits.violations == before
         assert any(contact.surface == "mallet" for contact in world.contacts)
     assert sum(scored) >= 2, scored
+
+
+def leaves(world, place, angle, share, seed):
+    """Strike a puck that lies there: the model's direction of its way for the contact, and the true one."""
+    world.reset(puck=(*table.to_base(place), 0.0), joints=TABLE.rules.home)
+    mpc, along = StrikeMpc(TABLE, seed=seed), np.array([np.cos(angle), np.sin(angle)])
+    speed, touch = share * TABLE.speeds([place], [angle])[0], world.time + 1.4
+    contact = MalletContact(touch, np.concatenate([place - TABLE.contact_distance * along, speed * along]))
+    while not any(each.surface == "mallet" for each in world.contacts) and world.time < touch + 0.3:
+        step = mpc.step(world.time, world.joint_position, world.joint_velocity, contact)
+        assert step.valid, step.message
+        mpc.accept(step)
+        world.follower.accept(TrajectoryCommand.of(step.trajectory, JOINT_NAMES), world.time)
+        world.advance(0.02)
+    hit = next(each for each in world.contacts if each.surface == "mallet")
+    told = MODEL.hit([[*place, 0.0, 0.0]], contact.mallet[None])[0][0, 2:]
+    return math.atan2(told[1], told[0]), math.atan2(hit.velocity_after[1], hit.velocity_after[0])
+
+
+def test_a_puck_leaves_in_the_direction_that_the_model_has_for_the_contact(world):
+    """Within a degree, though the mallet swings, leans and turns while it pushes: on average within half."""
+    rng, off = np.random.default_rng(1210), []
+    while len(off) < 10:
+        place, angle = rng.uniform([-0.65, -0.2], [-0.4, 0.2]), np.deg2rad(rng.uniform(-40.0, 40.0))
+        if TABLE.speeds([place], [angle])[0] < 1.0:
+            continue
+        told, found = leaves(world, place, angle, rng.uniform(0.7, 0.95), seed=len(off))
+        off.append(np.degrees(found - told))
+    assert np.abs(off).max() < 1.0, off
+    assert np.abs(off).mean() < 0.5, off

@@ -39,6 +39,7 @@ from sim_bridge.experiments.hockey.shooting_summary import (
 from sim_bridge.experiments.hockey.shooting_trials import GOAL, ShotResult, Trial, banks
 from sim_bridge.hockey import table as field
 from sim_bridge.hockey.contact_log import PuckContact
+from sim_bridge.hockey.mallet import MalletConfig
 from sim_bridge.hockey.recordings import Strike, strike_command
 from sim_bridge.hockey.scene import AirHockeyScene
 from sim_bridge.hockey.world import AirHockeyWorld
@@ -76,12 +77,17 @@ def test_moving_pucks_come_towards_the_robot():
     assert (-states[:, 2] / speed >= 0.5 - 1e-12).all()
 
 
+def parameters(scene, mallet):
+    hinges = {"hinge_stiffness": mallet.stiffness, "hinge_damping": mallet.damping}
+    return {**dataclasses.asdict(scene), **hinges}
+
+
 def test_worlds_differ_from_the_nominal_one_within_the_spread():
-    nominal = AirHockeyScene()
-    assert plant(ShotTask("conservative", 1000, nominal=True)) == nominal
-    drawn = [plant(ShotTask("conservative", seed)) for seed in range(1000, 1200)]
+    assert plant(ShotTask("conservative", 1000, nominal=True)) == (AirHockeyScene(), MalletConfig())
+    nominal = parameters(AirHockeyScene(), MalletConfig())
+    drawn = [parameters(*plant(ShotTask("conservative", seed))) for seed in range(1000, 1200)]
     for name, share in SPREAD.items():
-        ratios = np.array([getattr(scene, name) for scene in drawn]) / getattr(nominal, name)
+        ratios = np.array([world[name] for world in drawn]) / nominal[name]
         assert 0.9 * share < np.abs(ratios - 1.0).max() <= share
 
 
@@ -338,7 +344,13 @@ def test_broken_rules_are_named_in_the_verdict():
     summary = summarise(results(violations={"limits": 2, "height": 3}))
     assert summary["constraint_violations"] == 5 * 40 * len(PLAYERS)
     (missed,) = missed_targets(summary)
-    assert "limits 560" in missed and "height 840" in missed
+    cycles = 40 * len(PLAYERS)
+    assert f"limits {2 * cycles}" in missed and f"height {3 * cycles}" in missed
+
+
+def test_trajectories_that_the_controller_refused_are_named_in_the_verdict():
+    (missed,) = missed_targets(summarise([dataclasses.replace(shot, refused=2) for shot in results()]))
+    assert f"refused {80 * len(PLAYERS)} trajectories" in missed
 
 
 def test_the_command_fails_and_says_why(tmp_path, monkeypatch, capsys):

@@ -60,7 +60,7 @@ class StrikeTask:
         fresh = now - self._received <= self._config.contact_timeout_in_force
         contact = self.contact if fresh else None
         step = self.planner.step(now, position, velocity, contact)
-        if contact is not None and not step.valid and contact.time > now:
+        if contact is not None and step.refused:
             self._refusals.publish(self._message)
         if step.trajectory is None:
             return step

@@ -41,6 +41,7 @@ class MpcStep:
         plane: solution in the plane, for the next warm start.
         ready_at: nothing is planned before this time [s].
         warning: what works less well than it should, in words, if anything.
+        refused: whether what was asked for cannot be done, so that something else should be asked for.
         spread: standard deviation of the predicted object position, shape (K,) [m], if it was predicted.
     """
 
@@ -56,6 +57,7 @@ class MpcStep:
     ready_at: float = -np.inf
     spread: NDArray = dataclasses.field(default_factory=lambda: np.zeros(0))
     warning: str = ""
+    refused: bool = False
 
 
 class ReferencePlanner(abc.ABC):

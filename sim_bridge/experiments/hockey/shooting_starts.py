@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.hockey import table
+from sim_bridge.hockey.mallet import MalletConfig
 from sim_bridge.hockey.scene import AirHockeyScene
 from sim_bridge.hockey.world import AirHockeyWorld
 
@@ -22,8 +23,12 @@ PASS_SPEED, PASS_ANGLE = (0.2, 0.5), math.radians(60.0)
 """How fast they are [m/s], and how far their direction is from straight at the robot."""
 SPREAD = {
     "drag": 0.2, "rim_damping": 0.15, "mallet_damping": 0.1, "joint_friction": 0.3, "joint_damping": 0.3,
+    "hinge_stiffness": 0.1, "hinge_damping": 0.1,
 }  # fmt: skip
-"""By which share of their values in the planner's world the parameters of others differ at most."""
+"""By which share of their values in the planner's world the parameters of others differ at most.
+
+The hinges are those of the mallet; for its swing the planner takes their gains to be the nominal ones.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,17 +62,21 @@ def start(task: ShotTask) -> NDArray[np.float64]:
     return np.array([*place, speed * math.cos(angle), speed * math.sin(angle)])
 
 
-def plant(task: ShotTask) -> AirHockeyScene:
+def plant(task: ShotTask) -> tuple[AirHockeyScene, MalletConfig]:
     """The world's parameters, which no planner is told."""
-    scene, rng = AirHockeyScene(), np.random.default_rng([task.seed, 1])
+    scene, mallet, rng = AirHockeyScene(), MalletConfig(), np.random.default_rng([task.seed, 1])
     if task.nominal:
-        return scene
+        return scene, mallet
     factors = {name: 1.0 + share * rng.uniform(-1.0, 1.0) for name, share in SPREAD.items()}
-    return dataclasses.replace(scene, **{name: getattr(scene, name) * f for name, f in factors.items()})
+    stiffness = factors.pop("hinge_stiffness") * mallet.stiffness
+    damping = factors.pop("hinge_damping") * mallet.damping
+    other = dataclasses.replace(scene, **{name: getattr(scene, name) * f for name, f in factors.items()})
+    return other, MalletConfig(stiffness=stiffness, damping=damping)
 
 
 def world_of(task: ShotTask) -> AirHockeyWorld:
     """A fresh world with the puck at its start, the arm at home."""
-    world, puck = AirHockeyWorld(plant(task), seed=task.seed), start(task)
+    (scene, mallet), puck = plant(task), start(task)
+    world = AirHockeyWorld(scene, seed=task.seed, mallet=mallet)
     world.reset((*table.to_base(puck[:2]), 0.0), (*puck[2:], 0.0))
     return world

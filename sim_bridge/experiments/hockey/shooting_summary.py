@@ -139,6 +139,8 @@ def missed_targets(summary: dict[str, Any]) -> list[str]:
     broken = summary["constraint_violations"]
     kinds = ", ".join(f"{kind} {count}" for kind, count in summary["violations_by_kind"].items())
     checks[f"limits or rules are broken in {broken} cycles ({kinds})"] = broken == 0
+    refused = sum(row["refused"] for name, row in summary.items() if name in PLAYERS)
+    checks[f"the arm's controller refused {refused} trajectories"] = refused == 0
     for key, most in (("p99", STEP_P99), ("max", STEP_MAX)):
         value = summary[f"step_ms_{key}"]
         checks[f"the agent's steps take {value:.1f} ms ({key}), allowed {most:g}"] = value <= most

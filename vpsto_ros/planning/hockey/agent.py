@@ -177,7 +177,7 @@ class HockeyAgent:
         shot = self.planner.plan(now, puck, q)
         contact = MalletContact(shot.time, shot.mallet) if shot is not None else None
         step = self.mpc.step(now, q, qd, contact)
-        if shot is not None and not step.valid:
+        if shot is not None and step.refused:
             self.planner.refuse()
             complaints.append(f"shot refused: {step.message}")
         self.mpc.accept(step)

@@ -5,16 +5,19 @@ joint is in the plane of play, so that every candidate stays near it.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vpsto_ros.exceptions import InfeasibleError
 from vpsto_ros.optimization.progress import Evaluation
 from vpsto_ros.planning.hockey.motion_kernels import assess, to_height
 from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.priors.gaussian import GaussianPrior
 from vpsto_ros.priors.smoothness import smoothness_prior
-from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, minimal_duration
+from vpsto_ros.robot.iiwa_kinematics import arm_points, move_to
+from vpsto_ros.trajectory import Limits, OptimalBasis, Trajectory, minimal_duration, synthesize
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,7 +81,10 @@ class PlayMotion:
         begin, end: its two states; the time of the end counts only if it is given.
     """
 
-    def __init__(self, play: Play, begin: ArmState, end: ArmState, guess: NDArray, last: float = 0.0) -> None:
+    def __init__(
+        self, play: Play, begin: ArmState, end: ArmState, guess: NDArray, last: float = 0.0,
+        hint: NDArray | None = None,
+    ) -> None:  # fmt: skip
         """Pose the problem.
 
         Args:
@@ -87,9 +93,10 @@ class PlayMotion:
             end: state at the end, to be reached at its time; as soon as the limits allow if that is infinite.
             guess: a position on the way, shape (7,) [rad]: where the run-up begins, or where a brake ends.
             last: for how long before the end there shall be no via-point, 0: evenly spaced ones [s].
+            hint: via-points (N, 7) of an earlier search that came close, to look at first.
         """
         self.play, self.begin, self.end, self.start_time = play, begin, end, begin.time
-        self._guess, self._last = guess, last
+        self._guess, self._last, self._hint = guess, last, hint
         self._bases: dict[int, OptimalBasis] = {}
         self._priors: dict[int, GaussianPrior] = {}
 
@@ -161,10 +168,74 @@ class PlayMotion:
         return self._priors[n_via]
 
     def guesses(self, n_via: int) -> NDArray[np.float64]:
-        """Straight to the guess and on from there, and the mean of the prior, (2, N, 7)."""
+        """Straight to the guess and on from there, the mean of the prior, and the hint, (S, N, 7)."""
         share = np.arange(1, n_via + 1)[:, None] / n_via
         if self.timed:
             way = self.begin.position + share * (self._guess - self.begin.position)
         else:
             way = self._guess + (share - 1.0 / n_via) * (self.end.position - self._guess)
-        return np.stack([way, self.prior(n_via).mean_points])
+        found = [way, self.prior(n_via).mean_points]
+        if self._hint is not None and len(self._hint) == n_via:
+            found.append(self._hint)
+        return np.stack(found)
+
+
+_RAISED = 0.12  # by how much the universal joint is raised to get over what stands on the table [m]
+_CHECKED = 60  # postures of a motion that are looked at
+_HARDLY = 1e-3  # arms that begin too low may be so much lower on their way [m]
+
+
+def way_in(play: Play, position: NDArray, start: float, share: float) -> Trajectory:
+    """Home from rest outside the plane of play: straight in the joints, or up, across and down; slowly.
+
+    Args:
+        play: rules and limits.
+        position: joint positions at the start, shape (7,) [rad].
+        start: time of the start [s].
+        share: of the velocity limits.
+
+    Raises:
+        InfeasibleError: on either way the arm would touch the table or come too low.
+    """
+    home = np.array(play.rules.home)
+    for keys in ([position, home], [position, _raised(play, position), _raised(play, home), home]):
+        if any(key is None for key in keys):
+            continue
+        way = _straight([key for key in keys if key is not None], play.limits, start, share)
+        if _clear(play, way):
+            return way
+    raise InfeasibleError("the arm cannot get home without coming too low; move it by hand above the table")
+
+
+def _raised(play: Play, position: NDArray) -> NDArray[np.float64] | None:
+    """The posture with the universal joint right above where it is, well above the plane of play."""
+    q, (x, y, z) = position.copy(), arm_points(position[None])[0, 3]
+    arm, axes, jac = np.empty((4, 3)), np.empty((7, 3)), np.empty((3, 6))
+    return q if move_to(q, x, y, max(z, play.rules.height) + _RAISED, arm, axes, jac) else None
+
+
+def _straight(keys: list[NDArray], limits: Limits, start: float, share: float) -> Trajectory:
+    """From rest to rest along straight lines between postures."""
+    slow = Limits(share * limits.velocity, share * limits.acceleration)
+    still, whole = np.zeros(len(keys[0])), None
+    for first, second in itertools.pairwise(keys):
+        begin = start if whole is None else whole.end_time
+        part = synthesize(
+            OptimalBasis.uniform(0), np.stack([first, second]), still, still, slow, start_time=begin
+        )
+        whole = part if whole is None else whole.followed_by(part)
+    assert whole is not None
+    return whole
+
+
+def _clear(play: Play, motion: Trajectory) -> bool:
+    """Whether joints keep their range, the universal joint stays above the table and the arm high enough."""
+    rows = motion(np.linspace(motion.start_time, motion.end_time, _CHECKED))
+    points, (lower, upper) = arm_points(rows), play.limits.position_range
+    arm, joint = points[:, 1:3, 2].min(axis=1), points[:, 3, 2]
+    least = min(play.rules.clearance, arm[0] - _HARDLY)
+    lowest = min(play.rules.height - play.rules.height_tolerance, joint[0] - _HARDLY)
+    within = np.all((rows[1:] >= lower) & (rows[1:] <= upper)) or not np.all(
+        (rows[0] >= lower) & (rows[0] <= upper)
+    )
+    return bool(within and arm.min() >= least and joint.min() >= lowest)

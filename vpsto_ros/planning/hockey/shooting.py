@@ -27,6 +27,8 @@ SEARCHING = "contact times are being searched"
 """Why there is no shot yet, before the first round is over."""
 STRUCK = "the puck has just been struck"
 """Why there is no shot for a moment after a touch."""
+_CAUTION = 1.15  # factor on the time that the arm is said to need, for every shot that it refuses
+_MOST_CAUTION = 2.0
 _ALIKE = (0.03, 0.15)  # times [s] and directions [rad] of shots that are much alike
 _REMEMBERED = 8  # shots that were refused
 _SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
@@ -93,6 +95,7 @@ class ShootingPlanner:
         self._drop(SEARCHING)
         if shot is not None:
             self._barred = [*self._barred[-_REMEMBERED:], shot]
+            self._times.caution = min(_MOST_CAUTION, _CAUTION * self._times.caution)
         if before is not None:
             self._commit(before)
 
@@ -113,12 +116,13 @@ class ShootingPlanner:
         objection = self._objection(now, puck, posture)
         if objection or puck is None:
             self._drop(objection)
+            self._times.caution = 1.0  # the next puck is another one
             return None
         if now < self._now:  # a clock that was set back
             self.forget()
         self._now = now
         if self.committed is not None and now >= self.committed.time:
-            self._struck = self.committed.time
+            self._struck, self._times.caution = self.committed.time, 1.0
             self._drop(STRUCK)
         if now - self._struck < self.config.pause:
             return None

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.vpsto import VpstoConfig
-from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion
+from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion, way_in
 from vpsto_ros.planning.hockey.strikes import Cell, StrikeTable
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
@@ -23,7 +23,7 @@ from vpsto_ros.planning.stitching import extended, resting
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.robot.mallet_tilt import MalletTilt
-from vpsto_ros.trajectory import OptimalBasis, Trajectory, synthesize
+from vpsto_ros.trajectory import Trajectory
 
 _SAME = 0.02  # contacts whose times differ by less are the same, told anew [s]
 _SAME_ANGLE = 0.35  # and whose directions do [rad]
@@ -51,6 +51,10 @@ class StrikeMpcConfig:
     final: float = option(
         0.1, "so shortly before the touch the motion is not called off", unit="s", minimum=0.0, maximum=1.0
     )
+    enter_share: float = option(
+        0.15, "share of the planned velocity limits at which the arm moves outside the plane of play",
+        minimum=0.01, maximum=1.0,
+    )  # fmt: skip
     joint_tolerance: float = option(
         0.1, "how far a joint may be from its reference before the arm counts as lost", unit="rad",
         minimum=1e-3, maximum=1.0,
@@ -78,6 +82,10 @@ class StrikeMpcConfig:
             n_via=3, stop_duration=0.0, warm_sigma=0.2, search=VpstoConfig(population=12, iterations=2)
         )
     )
+    attempts: int = option(
+        4, "cycles in which a motion into a new contact is searched before it is refused", minimum=1,
+        maximum=100,
+    )  # fmt: skip
     first_iterations: int = option(
         8, "iterations of a search that has nothing to start from", minimum=1, maximum=1000
     )
@@ -123,6 +131,10 @@ class MalletContact:
         return bool(abs(turned) < _SAME_ANGLE)
 
 
+_Planned = tuple[Trajectory, MalletContact, Cell, Trajectory | None, Trajectory | None]
+"""What a step planned: all of it, the contact, its entry, and the motions into it and home."""
+
+
 class StrikeMpc(ReferencePlanner):
     """Plans step after step: waits at home, strikes when it is told where and when, follows through, returns.
 
@@ -165,12 +177,17 @@ class StrikeMpc(ReferencePlanner):
         }
         self._usual = {online: online.config for online in self._first}
         self._swing: tuple[float, NDArray] | None = None
+        self._planned: _Planned | None = None
+        self._hint: NDArray | None = None
         self.forget_plan()
 
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
         self.contact: MalletContact | None = None
         self._cell: Cell | None = None
+        self._planned = None
+        self._tried: MalletContact | None = None
+        self._attempts, self._hint = 0, None
         self._approach.accept(None)
         self._return.accept(None)
 
@@ -204,6 +221,15 @@ class StrikeMpc(ReferencePlanner):
             return self._withdraw(now, takeover)
         return self._go_on(now)
 
+    def accept(self, step: MpcStep) -> None:
+        """Take note that a step's trajectory is being executed."""
+        super().accept(step)
+        planned, self._planned = self._planned, None
+        if planned is not None and step.refused is False and planned[0] is step.plane:
+            self.contact, self._cell = planned[1], planned[2]
+            self._approach.accept(planned[3])
+            self._return.accept(planned[4])
+
     def forget_contact(self) -> None:
         """The touch is over."""
         self.contact, self._cell = None, None
@@ -225,19 +251,8 @@ class StrikeMpc(ReferencePlanner):
         self.reset()
         if np.abs(qd).max() > AT_REST:
             return MpcStep(None, "wait", False, "the arm moves and does not follow this planner's reference")
-        at_rest = resting(q, now, now + self.config.lead)
-        begin = ArmState(now + self.config.lead, q, np.zeros(7))
-        try:
-            way, mode = self._homewards(begin), "return"
-        except InfeasibleError:
-            # From outside the plane of play: straight in the joints, which nothing in the way is known of.
-            keys, still = np.stack([q, self.home]), np.zeros(7)
-            way = synthesize(
-                OptimalBasis.uniform(0), keys, still, still, self.play.limits, start_time=begin.time
-            )
-            mode = "enter"
-        self.reference = at_rest
-        return MpcStep(at_rest.followed_by(way), mode, True, "on the way home")
+        self.reference = resting(q, now, now + self.config.lead)
+        return self._go_home(now)
 
     def _go_on(self, now: float) -> MpcStep:
         """What runs is right."""
@@ -247,8 +262,22 @@ class StrikeMpc(ReferencePlanner):
             return MpcStep(rest, "follow", True, "")
         position = running(running.end_time)
         if np.abs(position - self.home).max() > 1e-3:
-            return self._stop(now, "return", "on the way home", valid=True)
+            return self._go_home(now)
         return MpcStep(resting(position, now, now + 0.5), "hold", True, "waits at home")
+
+    def _go_home(self, now: float) -> MpcStep:
+        """From rest anywhere: in the plane of play if the arm is in it, else slowly into it."""
+        takeover = now + self.config.lead
+        begin = ArmState(takeover, extended(self._running, takeover)(takeover), np.zeros(7))
+        try:
+            return MpcStep(self._joined(now, self._homewards(begin)), "return", True, "on the way home")
+        except InfeasibleError:
+            pass
+        try:
+            way = way_in(self.play, begin.position, takeover, self.config.enter_share)
+        except InfeasibleError as error:
+            return MpcStep(None, "wait", False, str(error))
+        return MpcStep(self._joined(now, way), "enter", True, "slowly into the plane of play")
 
     def _moves_after(self, now: float) -> bool:
         running = self._running
@@ -280,11 +309,14 @@ class StrikeMpc(ReferencePlanner):
     def _strike(self, now: float, takeover: float, contact: MalletContact) -> MpcStep:
         """Plan into the touch, on, and home."""
         fresh = not contact.continues(self.contact)
+        if not contact.continues(self._tried):
+            self._attempts, self._hint = 0, None
+        self._tried = contact
         cell = self._cell
         if fresh or cell is None:
             cell = self.table.cell(contact.mallet, self._running(now))
         if cell is None:
-            return self._refuse(now, "there is no strike in the table for this contact")
+            return self._refuse(now, "there is no strike in the table for this contact", fresh)
         begin = self._begin(takeover, contact, fresh)
         before = self._approach.previous, self._return.previous
         if fresh:
@@ -294,14 +326,17 @@ class StrikeMpc(ReferencePlanner):
             result, whole = self._through(now, begin, cell, contact, None if fresh else self._running)
             for _ in range(self.config.first_rounds - 1 if fresh else 0):
                 result, whole = self._through(now, begin, cell, contact, whole)
+            self._planned = (whole, contact, cell, self._approach.previous, self._return.previous)
         except InfeasibleError as error:
+            return self._refuse(now, str(error), fresh)
+        finally:  # what is planned is only remembered when it is accepted
             self._approach.accept(before[0])
             self._return.accept(before[1])
-            return self._refuse(now, str(error))
-        self.contact, self._cell = contact, cell
         iterations = result.search.iterations if result.search is not None else 0
         path = self._tool(whole(np.linspace(whole.start_time, whole.end_time, 40)))
-        return MpcStep(whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path)
+        return MpcStep(
+            whole, result.mode, True, "", cost=result.cost, iterations=iterations, tool_path=path, plane=whole
+        )
 
     def _through(
         self, now: float, begin: ArmState, cell: Cell, contact: MalletContact,
@@ -321,16 +356,25 @@ class StrikeMpc(ReferencePlanner):
         """
         target = self._target(cell, contact, now, motion)
         run_up, duration = self.table.start(cell), self.table.config.run_up
-        result = self._plan(self._approach, PlayMotion(self.play, begin, target, run_up, duration))
+        result = self._plan(
+            self._approach, PlayMotion(self.play, begin, target, run_up, duration, self._hint)
+        )
         if result.trajectory is None:
+            self._hint = None if result.search is None else result.search.best_any_points
             raise InfeasibleError("no motion into this contact keeps limits and rules")
         onwards = self._follow_through(target)
         self._approach.accept(result.trajectory)
         return result, self._joined(now, result.trajectory.followed_by(onwards))
 
-    def _refuse(self, now: float, why: str) -> MpcStep:
-        """Go on with what runs: it is whole, and ends at home."""
-        return dataclasses.replace(self._go_on(now), valid=False, message=why)
+    def _refuse(self, now: float, why: str, fresh: bool) -> MpcStep:
+        """Go on with what runs: it is whole, and ends at home. If it leads into this contact, all is well."""
+        step = self._go_on(now)
+        self._attempts += 1
+        if fresh and self._attempts < self.config.attempts:
+            return dataclasses.replace(step, valid=False, message=f"still searching: {why}")
+        if not fresh:
+            return dataclasses.replace(step, warning=f"the last plan for this contact goes on: {why}")
+        return dataclasses.replace(step, valid=False, message=why, refused=True)
 
     def _begin(self, takeover: float, contact: MalletContact, fresh: bool) -> ArmState:
         """Where planning begins: at the takeover, or later while there is time to wait."""
