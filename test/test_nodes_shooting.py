@@ -29,10 +29,10 @@ from vpsto_ros.nodes.conversions import (
     state_message,
     withdrawal_message,
 )
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.nodes.table_frame import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
 from vpsto_ros.planning.hockey.shot_preview import preview

@@ -12,10 +12,10 @@ from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
 from vpsto_ros.nodes.conversions import contact_message, read_state, withdrawal_message
-from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
+from vpsto_ros.nodes.table_frame import MALLET
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingPlanner, Shot
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
