@@ -1,7 +1,6 @@
 """Start the nodes of the air-hockey demo on a ROS 2 installation: those of push_box with other parameters.
 
     ros2 launch vpsto_ros air_hockey.launch.py
-    ros2 launch vpsto_ros air_hockey.launch.py simulation:=false    # beside a real iiwa and a camera
 
 Then bring pucks, one after the other:
 
@@ -24,7 +23,6 @@ def generate_launch_description():
     arguments = {
         "params_file": (str(share / "config" / "air_hockey.yaml"), "parameters of the nodes"),
         "namespace": ("", "namespace of all nodes and topics"),
-        "simulation": ("true", "false beside a real robot"),
     }
     return LaunchDescription(
         [

@@ -54,6 +54,7 @@ class Node:
 
     def __init__(self, hand):
         self.hand, self.listeners, self.speed = hand, {}, 0.0
+        self.pose = np.array([1.0, 0.1, 0.0])
 
     def create_client(self, _kind, _name):
         return self.hand
@@ -65,7 +66,7 @@ class Node:
         return np.full(7, self.speed)
 
     def object_pose(self):
-        return np.array([1.0, 0.1, 0.0])
+        return self.pose
 
 
 def event(time, end="far", speed=1.5):
@@ -117,6 +118,7 @@ def test_a_puck_that_is_hit_once_and_comes_to_the_far_goal_scores(played):
     [
         ([("touches", event(2.0)), ("goals", event(3.0, "near"))], OWN_GOAL),
         ([("touches", event(2.0)), ("touches", event(2.6))], MISSED),
+        ([("touches", event(2.0)), ("touches", event(2.2)), ("goals", event(3.0))], GOAL),  # the mallet drags
         ([("goals", event(3.0))], MISSED),  # it went in by itself
         ([("goals", event(0.0)), ("touches", event(2.0)), ("goals", event(3.0))], GOAL),  # of an older puck
     ],
@@ -127,6 +129,18 @@ def test_what_does_not_count(played, events, outcome):
     for topic, message in events:
         node.listeners[topic](message)
     assert script.shots[0].outcome == outcome
+
+
+def test_a_pucks_place_is_seen_after_it_was_put_there(played):
+    script, node = played()
+    node.pose = np.array([2.5, 0.0, 0.0])  # of the puck before, in the goal
+    act(script, 0.0, 0.03)
+    assert len(script.shots) == 1 and np.isnan(script.shots[0].place).all()
+    node.pose = np.array([1.1, -0.2, 0.3])
+    script.act(0.04)
+    node.pose = np.array([1.2, -0.2, 0.3])
+    script.act(0.06)
+    np.testing.assert_array_equal(script.shots[0].place, [1.1, -0.2])
 
 
 def test_patience_ends(played):
@@ -238,7 +252,7 @@ def test_the_file_fits_the_nodes_and_they_agree():
         )
     )
     assert estimator.kind == "puck" and contact.kind == planner.kind == "shooting"
-    assert estimator.hockey == contact.hockey == planner.hockey
+    assert estimator.hockey.surface == contact.hockey.surface == planner.hockey.surface
     assert {estimator.base_frame, contact.base_frame, planner.base_frame} == {"iiwa_link_0"}
     world = settings.driver.simulation()
     assert world.surface == estimator.surface

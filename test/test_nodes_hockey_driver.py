@@ -147,6 +147,20 @@ def test_a_puck_that_finds_no_place_is_refused_with_the_reason(cell):
     assert made.driver.report().values["pucks"] == 0
 
 
+def test_a_reset_without_a_place_for_the_puck_changes_nothing(cell):
+    made = cell(hockey__pucks__x=[0.65, 0.65], hockey__pucks__y=[0.0, 0.0])
+    made.connect()
+    made.advance(0.1)
+    world = made.driver.simulation
+    made.send(reach(world, 0.3))
+    made.advance(2.5)
+    puck = world.puck_pose()
+    answer = call(made, Trigger, "franka_driver/reset", Trigger.Request())
+    assert not answer.success and "under the mallet" in answer.message
+    assert world.joint_position[0] == pytest.approx(0.3, abs=5e-3)
+    np.testing.assert_allclose(world.puck_pose(), puck, atol=1e-6)
+
+
 def test_goals_are_announced_once_and_counted(cell):
     made = cell()
     made.listen(Odometry, "franka_driver/goals")

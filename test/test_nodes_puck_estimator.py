@@ -19,12 +19,12 @@ from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckFilterConfig, PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.conversions import SIMULATED, observation_message, read_belief, read_state
-from vpsto_ros.nodes.hockey_table import UNKNOWN_YAW, HockeyTableConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.nodes.puck_estimator import puck_model
 from vpsto_ros.nodes.state_estimator import StateEstimator
 from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
+from vpsto_ros.nodes.table_frame import UNKNOWN_YAW, HockeyTableConfig
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 from node_bench import Bench
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import MarkerArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from sim_bridge.hockey.table import TABLE_ORIGIN
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
@@ -30,10 +30,10 @@ from vpsto_ros.nodes.conversions import (
     state_message,
     withdrawal_message,
 )
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.nodes.joint_conversions import joint_state_message, read_trajectory
 from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.nodes.table_frame import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
 from vpsto_ros.planning.hockey.shot_preview import preview
@@ -131,6 +131,26 @@ def test_what_is_expected_is_drawn(shooter):
     assert way[-1, 0] > TABLE.x + MODEL.table.half_length and abs(way[-1, 1]) < 0.125
     np.testing.assert_allclose(way[:, 2], TABLE.surface, atol=0.01)
     assert "to score" in drawn["shot"].text and len(drawn["shot_spread"].points) > 40
+
+
+@pytest.mark.parametrize("loss", ["out of reach", "gone"])
+def test_what_was_expected_of_a_shot_vanishes_with_it(shooter, loss):
+    shooter.advance(0.4, each=known(shooter))
+    assert shooter.node.task.planner.committed is not None
+    without = known(shooter, (0.5, 0.0)) if loss == "out of reach" else lambda _: arm(shooter)
+    shooter.advance(0.4, each=without)
+    last = {m.ns: m for m in shooter.received["contact_planner/markers"][-1].markers}
+    gone = {"shot_path", "shot_spread", "touch", "stroke"} | ({"puck_path"} if loss == "gone" else set())
+    assert {name for name, marker in last.items() if marker.action == Marker.DELETE} == gone
+    assert "no " in last["shot"].text
+
+
+def test_a_contact_is_as_sure_as_the_puck_will_be(shooter):
+    shooter.advance(0.5, each=known(shooter))
+    message, task = shooter.received["contact_plan"][-1], shooter.node.task
+    seen = preview(MODEL, task.planner.config, task.puck, task.planner.committed)
+    sent = read_contact(message, SIMULATED, FRAME).covariance
+    np.testing.assert_allclose(sent, seen.at_touch[:2, :2] + 1e-8 * np.eye(2), rtol=0.05, atol=1e-12)
 
 
 def test_a_refused_shot_is_dropped_and_another_is_sought(shooter):
@@ -392,6 +412,7 @@ def test_the_planners_are_where_their_strikes_are(bench, monkeypatch):
 
 def test_the_kind_decides_whose_lead_counts():
     config = MpcPlannerConfig(kind="shooting", rate=50.0)
-    assert config.lead == config.strike.lead and config.search[0] == "strike.approach.search"
+    assert config.lead == config.strike.lead
+    assert set(config.searches) == {"strike.approach.search", "strike.home.search"}
     with pytest.raises(ConfigurationError, match=r"strike.lead"):
         MpcPlannerConfig(kind="shooting", rate=50.0, deadline=0.0195)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_bridge.hockey.contact_log import ONE_TOUCH
+
 if TYPE_CHECKING:
     from rclpy.task import Future
 
@@ -32,10 +34,10 @@ class Shot:
 
     Attributes:
         start: when it was put down [s].
-        place: where (2,) [m].
+        place: where (2,) [m], NaN until it was seen there.
         chance: of scoring, as the planner said last before the touch; NaN before it said anything.
-        touched: when the mallet had hit it [s], NaN before.
-        speed: that it then had [m/s].
+        touched: when the mallet had hit it for the first time [s], NaN before.
+        speed: that it had when the mallet had hit it last [m/s].
         end: when it was over [s], NaN before.
         outcome: "goal", "missed", "own goal" or "no shot"; empty before the end.
         goal_speed: at the goal line [m/s].
@@ -52,7 +54,9 @@ class Shot:
 
 
 class ShootingScript:
-    """Brings pucks, and says what became of them. A puck counts once: a second touch makes it a miss.
+    """Brings pucks, and says what became of them.
+
+    A puck counts once: a touch that comes so late that it is another shot makes it a miss.
 
     Attributes:
         shots: so far, the present one included.
@@ -116,6 +120,7 @@ class ShootingScript:
         """Bring a puck when the arm rests, and give up on one that takes too long."""
         shot = self.present
         if shot is not None:
+            self._look_at(shot, now)
             touched = math.isfinite(shot.touched)
             if now - (shot.touched if touched else shot.start) > (FLIGHT if touched else self._patience):
                 self._finish(shot, now, MISSED if touched else NO_SHOT)
@@ -136,10 +141,15 @@ class ShootingScript:
             self._asked = self._hand.call_async(self._request)
 
     def _begin(self, now: float) -> None:
-        pose = self._observer.object_pose()
-        self.shots.append(Shot(now, np.full(2, np.nan) if pose is None else pose[:2]))
+        self.shots.append(Shot(now, np.full(2, np.nan)))
         if len(self.shots) == 1:
             self._start = now
+
+    def _look_at(self, shot: Shot, now: float) -> None:
+        """Note where the puck is as soon as there is a look at it that is later than the hand's answer."""
+        pose = self._observer.object_pose()
+        if np.isnan(shot.place).any() and now > shot.start and pose is not None:
+            shot.place = pose[:2]
 
     def _rests(self) -> bool:
         velocity = self._observer.joint_velocity()
@@ -158,10 +168,12 @@ class ShootingScript:
         shot, when = self.present, _seconds(message)
         if shot is None or when < shot.start:
             return
-        if math.isfinite(shot.touched):
+        if math.isnan(shot.touched):
+            shot.touched = when
+        if when > shot.touched + ONE_TOUCH:
             self._finish(shot, when, MISSED)
         else:
-            shot.touched, shot.speed = when, _speed(message)
+            shot.speed = _speed(message)
 
     def _see_goal(self, message: Any) -> None:
         shot, when = self.present, _seconds(message)

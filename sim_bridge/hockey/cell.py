@@ -1,9 +1,11 @@
 """Air hockey behind the simulated driver: goals, pucks that are brought back, the rules of play."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
@@ -93,15 +95,15 @@ class AirHockeyCell:
         """Put a puck somewhere, and the arm back unless it moves: a hand that brings a puck moves no arm."""
         world = self.world
         moves = np.abs(world.follower.reference(world.time)[1]).max() > AT_REST
-        if not moves:
-            world.reset()
-            self._touches = 0
-        self._put_puck()
+        self._put_puck(world.place_puck if moves else world.reset)
         arm = "moves, and goes on" if moves else "is back where it started"
         return f"a new puck is on the table, the arm {arm}; time goes on"
 
-    def _put_puck(self) -> str:
+    def _put_puck(self, put: Callable[[NDArray, NDArray], None]) -> str:
         """Put a puck where none is in the way, at random.
+
+        Args:
+            put: puts it at a pose (x, y, yaw) with a velocity, or raises and changes nothing.
 
         Raises:
             InvalidInputError: the mallet is everywhere where pucks are put.
@@ -109,7 +111,7 @@ class AirHockeyCell:
         for _ in range(_DRAWS):
             pose, velocity = self._config.hockey.pucks.draw(self._rng)
             try:
-                self.world.place_puck(pose, velocity)
+                put(pose, velocity)
             except InvalidInputError as error:
                 refused = error
                 continue
@@ -118,4 +120,4 @@ class AirHockeyCell:
         raise refused
 
     def _new_puck_requested(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._node.answer(self._put_puck, response)
+        return self._node.answer(lambda: self._put_puck(self.world.place_puck), response)

@@ -11,6 +11,8 @@ from sim_bridge.hockey.mallet import MalletState
 from sim_bridge.hockey.scene import SURFACES
 
 MALLET = "mallet"
+ONE_TOUCH = 0.3
+"""The mallet may touch the puck again so shortly after the first touch [s]; later it is another shot."""
 
 
 @dataclass(frozen=True)

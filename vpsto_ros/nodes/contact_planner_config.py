@@ -4,10 +4,10 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import PlayingSurfaceConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import PUSHING, TASKS, RobotConfig, check_task
 from vpsto_ros.nodes.scene import ModelConfig
+from vpsto_ros.nodes.table_frame import PlayingSurfaceConfig
 from vpsto_ros.planning.belief_space.config import RobustContactPlannerConfig
 from vpsto_ros.planning.contact import ContactPlannerConfig
 from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig

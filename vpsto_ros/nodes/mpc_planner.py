@@ -61,10 +61,10 @@ class MpcPlannerNode(ManagedNode):
         try:
             return KINDS[config.kind](self, config)
         except ModuleNotFoundError as error:
-            name, search = config.search
+            set_to = [f"{name}.strategy = '{search.strategy}'" for name, search in config.searches.items()]
             raise ConfigurationError(
-                f"{name}.strategy = '{search.strategy}' needs the Python "
-                f"package '{error.name}'; install it, or choose a strategy of this package, such as 'sep-cma'"
+                f"{' or '.join(set_to)} needs the Python package '{error.name}'; install it, or choose a "
+                "strategy of this package, such as 'sep-cma'"
             ) from error
 
     def cleanup(self) -> None:

@@ -4,7 +4,6 @@ import dataclasses
 
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import PlayingSurfaceConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import (
     PUSHING,
@@ -16,6 +15,7 @@ from vpsto_ros.nodes.robots import (
     check_task,
 )
 from vpsto_ros.nodes.scene import ModelConfig
+from vpsto_ros.nodes.table_frame import PlayingSurfaceConfig
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space.config import RobustMpcConfig
 from vpsto_ros.planning.hockey.strike_mpc import StrikeMpcConfig
@@ -118,12 +118,15 @@ class MpcPlannerConfig(NodeConfig):
         return getattr(self, self._group).joint_tolerance
 
     @property
-    def search(self) -> tuple[str, VpstoConfig]:
-        """Name and options of the search that plans."""
+    def searches(self) -> dict[str, VpstoConfig]:
+        """Options of the searches that plan, by their names."""
         return {
-            PUSHING: ("planner.online.search", self.planner.online.search),
-            ROBUST_PUSHING: ("robust.planning.search", self.robust.planning.search),
-            SHOOTING: ("strike.approach.search", self.strike.approach.search),
+            PUSHING: {"planner.online.search": self.planner.online.search},
+            ROBUST_PUSHING: {"robust.planning.search": self.robust.planning.search},
+            SHOOTING: {
+                "strike.approach.search": self.strike.approach.search,
+                "strike.home.search": self.strike.home.search,
+            },
         }[self.kind]
 
     @property

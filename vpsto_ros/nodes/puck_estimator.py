@@ -14,9 +14,9 @@ from vpsto_ros.estimation.object_state import ObjectState
 from vpsto_ros.estimation.particle_filter_config import FilterStatus
 from vpsto_ros.estimation.puck_filter import PuckFilter, PuckFilterConfig
 from vpsto_ros.nodes.estimators import Bridging
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig
 from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode
+from vpsto_ros.nodes.table_frame import HockeyTableConfig
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.mallet_observer import MalletObserver
 from vpsto_ros.robot.mallet_tilt import MalletTilt

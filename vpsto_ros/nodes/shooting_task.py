@@ -12,10 +12,10 @@ from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
 from vpsto_ros.nodes.conversions import contact_message, read_contact, read_state, withdrawal_message
-from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
+from vpsto_ros.nodes.table_frame import MALLET
 from vpsto_ros.planning.contact import ContactPlan
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingPlanner, Shot
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
@@ -66,6 +66,7 @@ class ShootingContacts:
     def missing(self, now: float, limit: float) -> str:
         """What keeps it from planning."""
         if self.puck is None or now - self.puck.stamp > limit:
+            self.puck = None
             return f"no object_state within {limit} s"
         return ""
 
@@ -77,7 +78,7 @@ class ShootingContacts:
             return self._no_shot()
         self._told = True
         self._chances.publish(Float64(data=shot.goal))
-        covariance = self._seen(shot).at_touch[:2, :2] + _LEAST_VARIANCE * np.eye(2)
+        covariance = self._spread(self.puck, shot) + _LEAST_VARIANCE * np.eye(2)
         place, frame = self._table.to_base(shot.mallet[:2]), self._config.base_frame
         touch = ContactPlan(shot.time, place, shot.mallet[2:], covariance)
         return [contact_message(touch, self._node.time_base, frame, MALLET)]
@@ -108,6 +109,11 @@ class ShootingContacts:
             make.line("stroke", stroke, markers.CONTACT),
         ]
 
+    def _spread(self, puck: PuckState, shot: Shot) -> NDArray:
+        """Covariance (2, 2) of where the puck is touched [m²]."""
+        ahead = np.array([max(shot.time - puck.stamp, 0.0)])
+        return self._model.predict(puck.mean, puck.covariance, ahead)[1][0, :2, :2]
+
     def _seen(self, shot: Shot | None) -> ShotPreview | None:
         if self.puck is None:
             return None
@@ -136,20 +142,21 @@ class ShootingContacts:
             preview(self._model, self.planner.config, puck, shot)
 
     def markers(self, make: markers.MarkerFactory) -> list[Marker]:
-        """The way of the puck that is expected with its ellipses of two standard deviations, and the shot."""
+        """The way of the puck that is expected, and the shot with ellipses of two standard deviations."""
         shot, seen = self.planner.committed, self._seen(self.planner.committed)
-        if seen is None:
-            return []
-        way = self._table.to_base(seen.mean[:, :2])
-        ellipses = slice(seen.touch, None, _DOTS) if shot is not None else slice(0, None, _DOTS)
-        spreads = 4.0 * seen.covariance[ellipses, :2, :2]
+        way, spreads, touch = np.zeros((0, 2)), np.zeros((0, 2, 2)), 0
+        if seen is not None:
+            way, spreads = self._table.to_base(seen.mean[:, :2]), 4.0 * seen.covariance[:, :2, :2]
+            touch = seen.touch
+        after = slice(touch, None, _DOTS)
         where = self._table.to_base(np.array([-0.3, 0.62]))
+        words = self.status() if seen is not None else "no puck"
         return [
-            make.line("puck_path", way[: seen.touch], markers.PREDICTION),
-            make.line("shot_path", way[seen.touch :], markers.PLAN),
-            make.ellipses("shot_spread", way[ellipses], spreads, markers.PREDICTION),
+            make.line("puck_path", way[:touch], markers.PREDICTION),
+            make.line("shot_path", way[touch:], markers.PLAN),
+            make.ellipses("shot_spread", way[after], spreads[after], markers.PREDICTION),
             *self._touch(make, shot),
-            make.text("shot", self.status(), (*where, self.surface + 0.1), 0.05),
+            make.text("shot", words, (*where, self.surface + 0.1), 0.05),
         ]
 
 

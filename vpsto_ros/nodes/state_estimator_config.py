@@ -8,10 +8,10 @@ from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
 from vpsto_ros.estimation.planar_kalman import PlanarKalmanConfig
 from vpsto_ros.estimation.puck_filter import PuckFilterConfig
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.nodes.hockey_table import HockeyTableConfig
 from vpsto_ros.nodes.lifecycle import NodeConfig
 from vpsto_ros.nodes.robots import RobotConfig
 from vpsto_ros.nodes.scene import ModelConfig, TableConfig
+from vpsto_ros.nodes.table_frame import HockeyTableConfig
 from vpsto_ros.robot.mallet_tilt import MalletTilt
 
 KALMAN, PARTICLES, PUCK = "kalman", "particles", "puck"

@@ -10,10 +10,10 @@ from visualization_msgs.msg import Marker
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.conversions import read_contact, require_frame
-from vpsto_ros.nodes.hockey_table import MALLET
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
+from vpsto_ros.nodes.table_frame import MALLET
 from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
 from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.running_reference import MpcStep

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim_bridge.experiments.hockey.shooting_players import player
 from sim_bridge.experiments.hockey.shooting_starts import ShotTask, world_of
-from sim_bridge.hockey.contact_log import MALLET, PuckContact
+from sim_bridge.hockey.contact_log import MALLET, ONE_TOUCH, PuckContact
 from sim_bridge.hockey.recordings import mallet_state, puck_state
 from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand, TrajectoryRejected
@@ -24,8 +24,6 @@ WITHOUT_TOUCH, AFTER_TOUCH = 10.0, 4.0
 """How long a shot is waited for, and how long its goal [s]."""
 AT_REST = 0.02
 """A puck that is slower has come to rest [m/s]."""
-ONE_TOUCH = 0.3
-"""The mallet may touch the puck again so shortly after the first touch [s]; later it is another shot."""
 WATCHED = 1.5
 """Limits and rules are watched for so long after the touch at least: until the arm is on its way back [s]."""
 GOAL = "goal"
