@@ -11,6 +11,7 @@ class StandInStrikes:
     def __init__(self, lead=0.6, slowest=1.2):
         self.x, self.y = np.linspace(-0.70, -0.20, 11), np.linspace(-0.40, 0.40, 17)
         self.angle = np.deg2rad(np.linspace(-70.0, 70.0, 29))
+        self.contact_distance = 0.0798  # of puck and mallet in the model that comes with the package
         self._lead, self._slowest = lead, slowest
 
     def speeds(self, puck, angles):

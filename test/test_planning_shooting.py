@@ -10,6 +10,7 @@ from strikes_bench import START, StandInStrikes
 
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingConfig, ShootingPlanner
 from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy
 
@@ -60,6 +61,13 @@ def test_a_resting_puck_is_shot_at_the_earliest_good_time(setting):
     assert least <= shot.time <= least + agent.config.lead_margin + 0.1
     np.testing.assert_allclose(shot.puck, [-0.4, 0.1, 0.0, 0.0], atol=1e-9)
     assert shot.goal > 0.5 and {s.time for s in shots[k:]} == {shot.time}
+
+
+def test_strikes_with_another_mallet_are_refused_before_any_shot():
+    strikes = StandInStrikes()
+    strikes.contact_distance += 0.01
+    with pytest.raises(ConfigurationError, match="apart at a touch"):
+        planner(strikes=strikes)
 
 
 def test_a_moving_puck_is_shot_where_it_will_be():

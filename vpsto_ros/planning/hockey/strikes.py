@@ -8,6 +8,7 @@ up and moved to the exact place.
 
 import dataclasses
 import functools
+import hashlib
 import itertools
 import json
 import math
@@ -121,6 +122,14 @@ class StrikeTable:
     def grids(self) -> tuple[NDArray, NDArray, NDArray]:
         """x, y and angle."""
         return self.x, self.y, self.angle
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Of what shots are chosen by: speeds, their grids and the distance at the touch."""
+        digest = hashlib.sha256(np.float64(self.contact_distance).tobytes())
+        for array in (*self.grids, self.speed):
+            digest.update(array.tobytes())
+        return digest.hexdigest()
 
     def speeds(self, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
         """Largest mallet speeds (B,) [m/s] for pucks (B, 2) and angles (B,); 0 where there is no strike.
