@@ -12,6 +12,7 @@ class StandInStrikes:
         self.x, self.y = np.linspace(-0.70, -0.20, 11), np.linspace(-0.40, 0.40, 17)
         self.angle = np.deg2rad(np.linspace(-70.0, 70.0, 29))
         self.center = np.array([1.51, 0.0])
+        self.contact_distance = 0.0798  # of puck and mallet in the model that comes with the package
         self._lead, self._slowest = lead, slowest
 
     def speeds(self, puck, angles):

@@ -229,7 +229,8 @@ def test_a_trained_policy_gives_the_angles_if_asked_to(bench):
 def test_a_preview_agrees_with_samples_of_the_model():
     rng = np.random.default_rng(1)
     state = PuckState(0.0, np.array([-0.5, 0.05, 0.02, 0.0]), np.diag([1e-7, 1e-7, 1e-5, 1e-5]), 0, "")
-    shot = Shot(0.5, MODEL.predict(state.mean, state.covariance, [0.5])[0][0], -0.05, 1.0, 0.9, 1.2, 0, 0.9)
+    puck, apart = MODEL.predict(state.mean, state.covariance, [0.5])[0][0], MODEL.table.contact_distance
+    shot = Shot(0.5, puck, -0.05, 1.0, 0.9, 1.2, 0, 0.9, apart)
     config = ShootingConfig(aim_std=0.0)
     seen = preview(MODEL, config, state, shot, step=0.02)
     assert seen.times[seen.touch] == pytest.approx(0.5) and seen.mean[-1, 0] > MODEL.table.half_length

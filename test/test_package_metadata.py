@@ -95,6 +95,12 @@ def test_the_library_never_imports_the_simulation():
     assert not [file for file, names in tops.items() if "sim_bridge" in names]
 
 
+def test_what_trains_needs_no_experiment():
+    names = {name for file in ROOT.glob("sim_bridge/learn/*.py") for name in imported_names(file)}
+    assert "vpsto_ros.planning.hockey.shooting_training.train" in names
+    assert not [name for name in names if name.startswith("sim_bridge.experiments")]
+
+
 def test_imports_are_found_wherever_they_are(tmp_path):
     (tmp_path / "a.py").write_text(
         "import vpsto_ros.robot.kinematics as k\nfrom vpsto_ros import nodes\n"

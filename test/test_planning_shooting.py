@@ -65,6 +65,13 @@ def test_a_resting_puck_is_shot_at_the_earliest_good_time(setting):
     assert shot.goal > 0.5 and {s.time for s in shots[k:]} == {shot.time}
 
 
+def test_strikes_with_another_mallet_are_refused_before_any_shot():
+    strikes = StandInStrikes()
+    strikes.contact_distance += 0.01
+    with pytest.raises(ConfigurationError, match="apart at a touch"):
+        planner(strikes=strikes)
+
+
 def test_a_moving_puck_is_shot_where_it_will_be():
     agent, states = planner(), course([-0.5, 0.3, 0.1, -0.4], 60)
     shots = run(agent, states[:40])

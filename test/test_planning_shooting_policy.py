@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.hockey.shooting_config import SETTINGS
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingObjective
 from vpsto_ros.planning.hockey.shooting_policy import (
     LAYERS,
     EnergyModel,
@@ -19,6 +20,7 @@ from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 LOW = np.array([-0.7, -0.4, -1.0, -1.0, -1.2])
 HIGH = np.array([-0.2, 0.4, 1.0, 1.0, 1.2])
+MODEL, STRIKES = PuckModel.load(SHIPPED), StrikeTable.load()
 STATE = np.array([-0.4, 0.1, 0.2, -0.3])
 
 
@@ -139,19 +141,25 @@ def test_nonsense_is_refused():
 
 def saved(path, models=None, **figures):
     models = models or {"conservative": random_model(), "aggressive": random_model(seed=5)}
-    save_policies(path, models, {name: {"epochs": 3, **figures} for name in models}, command="made", seed=4)
+    figures = {name: {"epochs": 3, **figures} for name in models}
+    save_policies(path, models, figures, MODEL, STRIKES, command="made", seed=4)
     return path
+
+
+def loaded(setting, path, model=MODEL, strikes=STRIKES):
+    return ShootingPolicy.load(setting, model, strikes, path)
 
 
 def test_a_file_gives_back_what_was_saved(tmp_path):
     path = saved(tmp_path / "policies.npz", training_s=2.5)
     for name, seed in (("conservative", 0), ("aggressive", 5)):
-        policy, model = ShootingPolicy.load(name, path), random_model(seed=seed)
+        policy, model = loaded(name, path), random_model(seed=seed)
         for layer in LAYERS:
             np.testing.assert_array_equal(policy.energy.weights[layer], model.weights[layer])
         np.testing.assert_array_equal(policy.energy.low, LOW)
         assert policy.origin["command"] == "made" and policy.origin["seed"] == 4
-        assert policy.origin["settings"] == {name: {"epochs": 3, "training_s": 2.5}}
+        figures = {"epochs": 3, "training_s": 2.5, "objective": dataclasses.asdict(SETTINGS[name])}
+        assert policy.origin["settings"] == {name: figures}
 
 
 def altered(path, **changes):
@@ -169,27 +177,27 @@ def altered(path, **changes):
 def test_files_that_are_no_policies_say_what_to_do(tmp_path):
     remedy = "vpsto learn shooting_policy"
     with pytest.raises(ConfigurationError, match=f"there are no shooting policies.*{remedy}"):
-        ShootingPolicy.load("balanced", tmp_path / "none.npz")
+        loaded("balanced", tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("no policy")
     (tmp_path / "empty.npz").write_bytes(b"")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     np.save(tmp_path / "array.npz.npy", np.zeros(3))
     for name in ("text.npz", "empty.npz", "other.npz", "array.npz.npy"):
         with pytest.raises(ConfigurationError, match=f"holds no shooting policies.*{remedy}"):
-            ShootingPolicy.load("balanced", tmp_path / name)
+            loaded("balanced", tmp_path / name)
     path = saved(tmp_path / "policies.npz")
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ConfigurationError, match=remedy):
-        ShootingPolicy.load("conservative", path)
+        loaded("conservative", path)
 
 
 def test_files_with_wrong_contents_are_refused(tmp_path):
     path = tmp_path / "policies.npz"
     with pytest.raises(ConfigurationError, match="no policy for the setting 'bold'; it has conservative"):
-        ShootingPolicy.load("bold", saved(path))
+        loaded("bold", saved(path))
     with pytest.raises(ConfigurationError, match="not trained"):
-        ShootingPolicy.load("conservative", saved(path, epochs=0))
+        loaded("conservative", saved(path, epochs=0))
     for change in (
         {"conservative__second": np.zeros((128, 127))},
         {"conservative__last": np.full(128, np.nan)},
@@ -200,17 +208,49 @@ def test_files_with_wrong_contents_are_refused(tmp_path):
     ):
         altered(saved(path), **change)
         with pytest.raises(ConfigurationError, match="no usable policy 'conservative'"):
-            ShootingPolicy.load("conservative", path)
-        ShootingPolicy.load("aggressive", path)
+            loaded("conservative", path)
+        loaded("aggressive", path)
     altered(saved(path), header=np.array(json.dumps({"format": "another", "settings": {}})))
     with pytest.raises(ConfigurationError, match="not of the format"):
-        ShootingPolicy.load("conservative", path)
+        loaded("conservative", path)
+
+
+def test_a_policy_of_another_objective_is_refused(tmp_path, monkeypatch):
+    path, wanted = saved(tmp_path / "policies.npz"), SETTINGS["aggressive"]
+    for change in ({"lambda1": 0.5}, {"lambda2": 2.0}, {"beta": 0.71}, {"least_banks": 1}):
+        monkeypatch.setitem(SETTINGS, "aggressive", dataclasses.replace(wanted, **change))
+        (name,) = change
+        with pytest.raises(ConfigurationError, match=f"objective.*{name}.*vpsto learn shooting_policy"):
+            loaded("aggressive", path)
+        loaded("conservative", path)
+    monkeypatch.setitem(SETTINGS, "aggressive", wanted)
+    loaded("aggressive", path)
+
+
+def test_a_policy_of_another_puck_or_arm_is_refused(tmp_path):
+    path = saved(tmp_path / "policies.npz")
+    wall = dataclasses.replace(MODEL.wall, matrix=MODEL.wall.matrix * [[1.0], [0.999]])
+    table = dataclasses.replace(MODEL.table, goal_width=0.26)
+    for change in ({"wall": wall}, {"table": table}, {"hit_delay": 0.5 * MODEL.hit_delay}):
+        with pytest.raises(ConfigurationError, match=r"another model of the puck;.*vpsto learn shooting"):
+            loaded("aggressive", path, model=dataclasses.replace(MODEL, **change))
+    for change in ({"speed": 0.99 * STRIKES.speed}, {"x": STRIKES.x + 0.01}, {"contact_distance": 0.08}):
+        with pytest.raises(ConfigurationError, match=r"other strikes of the arm;.*vpsto learn shooting"):
+            loaded("aggressive", path, strikes=dataclasses.replace(STRIKES, **change))
+
+
+def test_fingerprints_outlast_files(tmp_path):
+    MODEL.save(tmp_path / "puck.json")
+    STRIKES.save(tmp_path / "strikes.npz")
+    again = PuckModel.load(tmp_path / "puck.json"), StrikeTable.load(tmp_path / "strikes.npz")
+    loaded("aggressive", saved(tmp_path / "policies.npz"), *again)
 
 
 def test_the_policies_that_come_with_the_package_fit_its_strikes():
     strikes = StrikeTable.load()
-    for setting in SETTINGS:
-        policy = ShootingPolicy.load(setting)
+    for setting, objective in SETTINGS.items():
+        policy = ShootingPolicy.load(setting, PuckModel.load(SHIPPED), strikes)
+        assert ShootingObjective(**policy.origin["settings"][setting]["objective"]) == objective
         assert policy.origin["command"].startswith("vpsto learn shooting_policy --states")
         assert policy.origin["seed"] == 0
         low, high = policy.energy.low, policy.energy.high

@@ -10,7 +10,7 @@ from strikes_bench import StandInStrikes
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_motion import hit_time
 from vpsto_ros.exceptions import ConfigurationError
-from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, ShootingObjective, Shot
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, ShootingObjective
 from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
 
 MODEL, STRIKES = PuckModel.load(SHIPPED), StandInStrikes()
@@ -152,6 +152,13 @@ def test_a_place_without_strikes_gives_no_shot():
     assert search(strikes=Nothing()).best(0.0, PUCKS[0], COVARIANCE) is None
 
 
+def test_strikes_with_another_mallet_than_the_model_s_are_refused():
+    others = StandInStrikes()
+    others.contact_distance = MODEL.table.contact_distance + 0.001
+    with pytest.raises(ConfigurationError, match=r"0.0798 m apart.*0.0808 m by the strikes; `vpsto"):
+        search(strikes=others)
+
+
 def test_a_run_up_needs_room():
     finder, longer = search(), search(run_up=0.2)
     place, angle = np.array([[-0.69, 0.0]]), np.array([0.0])
@@ -183,6 +190,3 @@ def test_the_settings_are_those_of_the_thesis_but_for_one_threshold():
     assert found == [(1.0, 0.0, 0.5, 0), (1.0, 0.2, 0.5, 0), (0.0, 1.0, 0.7, 0)]
     with pytest.raises(ConfigurationError, match="time_step"):
         ShootingConfig(time_step=0.0)
-    assert Shot(0.0, np.zeros(4), 0.0, 1.0, 1.0, 1.0, 0, 1.0).contact_distance == pytest.approx(
-        MODEL.table.contact_distance
-    )

@@ -75,7 +75,7 @@ def test_the_first_angle_of_an_example_is_the_best(setting):
     finder, config = search(setting), TrainingConfig(states=60, actions=40)
     data = examples(finder, config, np.random.default_rng(1000))
     assert data.angles.shape == (len(data.states), 40) and 50 < len(data.states) <= 60
-    reserved = dataclasses.replace(SETTINGS[setting], beta=0.6)
+    reserved = dataclasses.replace(SETTINGS[setting], beta=SETTINGS[setting].beta + config.reserve)
     scores = score(finder, data.states, data.angles, config.covariance, reserved)
     np.testing.assert_array_equal(scores.argmax(axis=1), 0)
     scores = score(finder, data.states, data.angles, config.covariance)

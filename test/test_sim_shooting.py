@@ -137,7 +137,7 @@ STRIKE = Strike(
 )  # fmt: skip
 INTENDED = Shot(
     time=0.0, puck=np.array([-0.5, 0.0, 0.0, 0.0]), angle=0.0, speed=0.85, goal=0.9, goal_speed=0.5, banks=0,
-    value=0.9,
+    value=0.9, contact_distance=0.0798,
 )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from sim_bridge import cli
 from sim_bridge.experiments.hockey import shooting_policy as experiment
-from sim_bridge.experiments.hockey.shooting_comparison import STEPS, compare, shot_at
+from sim_bridge.learn.shooting_comparison import STEPS, compare, shot_at
 from sim_bridge.learn.shooting_policy import input_range, learn
 from vpsto_ros.planning.hockey.shooting_config import SETTINGS
 from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy, save_policies
@@ -39,7 +39,7 @@ def test_learn_command(tmp_path, capsys):
     text = capsys.readouterr().out
     assert status == (0 if "verdict: passed" in text else 1) and f"wrote {path}" in text
     for setting in SETTINGS:
-        policy = ShootingPolicy.load(setting, path)
+        policy = ShootingPolicy.load(setting, *experiment.models(), path)
         assert policy.origin["command"] == "vpsto learn shooting_policy --states 50 --epochs 2 --seed 1000"
         assert policy.origin["settings"][setting]["epochs"] == 2
 
@@ -116,7 +116,9 @@ def test_the_pucks_of_a_run_depend_on_its_seed_alone():
 def test_experiment_command(tmp_path, untrained):
     path = tmp_path / "policies.npz"
     figures = {setting: {"epochs": 1, "training_s": 2.0} for setting in SETTINGS}
-    save_policies(path, dict.fromkeys(SETTINGS, untrained), figures, command="test", seed=0)
+    model, strikes = experiment.models()
+    energies = dict.fromkeys(SETTINGS, untrained)
+    save_policies(path, energies, figures, model, strikes, command="test", seed=0)
     out = tmp_path / "out"
     arguments = ["--runs", "2", "--seed", "1000", "--jobs", "1", "--policies", str(path), "--out", str(out)]
     assert cli.main(["experiment", "shooting_policy", *arguments]) == 1

@@ -30,7 +30,8 @@ def planning(policy: bool, _cores: Cores) -> Action:
     """A step of the planner: pucks that lie still or roll, with noise, until they would have been shot."""
     model, strikes = PuckModel.load(SHIPPED), StrikeTable.load()
     config = ShootingConfig(objective=SETTINGS["balanced"])
-    planner = ShootingPlanner(model, strikes, config, ShootingPolicy.load("balanced") if policy else None)
+    trained = ShootingPolicy.load("balanced", model, strikes) if policy else None
+    planner = ShootingPlanner(model, strikes, config, trained)
     home, rng = np.array(strikes.rules.home), np.random.default_rng(0)
     pucks = states(planner.search, 200, 0.5, rng)
 
@@ -60,7 +61,8 @@ def contact_time(_cores: Cores) -> Action:
 
 def policy_step(_cores: Cores) -> Action:
     """A step of Algorithm 2, 25 of them from uniform samples for each puck."""
-    policy, rng = ShootingPolicy.load("aggressive"), np.random.default_rng(0)
+    policy = ShootingPolicy.load("aggressive", PuckModel.load(SHIPPED), StrikeTable.load())
+    rng = np.random.default_rng(0)
     pucks = states(_search("aggressive"), 200, TrainingConfig().fastest, rng)
 
     def steps() -> Iterator[None]:

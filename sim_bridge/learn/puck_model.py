@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from tqdm import tqdm
 
 from sim_bridge.cli import count
-from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import CONTACT_TIME, TABLE, Recorder, kind_of
+from sim_bridge.verdict import print_verdict
 from vpsto_ros.contact.linear_gaussian import LinearGaussian
 from vpsto_ros.contact.puck import MODES, PuckModel
 from vpsto_ros.contact.puck_learning import LabelledSteps, collect, fit, widened, widening

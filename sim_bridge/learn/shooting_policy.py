@@ -10,8 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sim_bridge.cli import count, file
-from sim_bridge.experiments.hockey.shooting_comparison import compare
-from sim_bridge.experiments.runs import print_verdict
+from sim_bridge.learn.shooting_comparison import compare
+from sim_bridge.verdict import print_verdict
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig
 from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy, save_policies
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(describe(setting, figures[setting]))
     path = pathlib.Path(arguments.out)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_policies(path, models, figures, command=command(arguments), seed=arguments.seed)
+    save_policies(path, models, figures, model, strikes, command=command(arguments), seed=arguments.seed)
     print(f"wrote {path}")
     poor = [setting for setting in SETTINGS if figures[setting]["objective_ratio"] < ENOUGH]
     ratios = ", ".join(f"{figures[setting]['objective_ratio']:.3f} ({setting})" for setting in SETTINGS)

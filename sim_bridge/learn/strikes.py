@@ -8,8 +8,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sim_bridge.cli import count
-from sim_bridge.experiments.runs import print_verdict
 from sim_bridge.hockey.recordings import TABLE
+from sim_bridge.verdict import print_verdict
 from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
 
 X = np.linspace(-0.75, -0.10, 14)

@@ -7,6 +7,7 @@ its centre, x towards the goal that is shot at.
 
 import dataclasses
 import functools
+import hashlib
 import pathlib
 from typing import Any
 
@@ -304,6 +305,12 @@ class PuckModel:
             rows += [*mode.matrix[:, :2], mode.offset, *mode.covariance]
             rows += [*mode.growth] if mode.growth.any() else [[0.0, 0.0], [0.0, 0.0]]
         return np.array([*rows, *self.mallet.matrix[:, 2:]])
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Of all its numbers: that of another model differs."""
+        table = np.array(dataclasses.astuple(self.table))
+        return hashlib.sha256(table.tobytes() + self.kernel_rows.tobytes()).hexdigest()
 
     @functools.cached_property
     def floating_table(self) -> NDArray[np.float64]:

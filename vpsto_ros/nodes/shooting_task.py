@@ -39,7 +39,7 @@ class ShootingContacts:
         if config.setting != OWN_SETTING:
             shooting = dataclasses.replace(shooting, objective=SETTINGS[config.setting])
         self._model = puck_model(config.puck_model)
-        policy = ShootingPolicy.load(config.setting) if config.policy else None
+        policy = ShootingPolicy.load(config.setting, self._model, strikes) if config.policy else None
         self.planner = ShootingPlanner(self._model, strikes, shooting, policy)
         self._warm_up(np.array(strikes.rules.home))
         self.forget()

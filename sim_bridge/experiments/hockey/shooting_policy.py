@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from sim_bridge.experiments.hockey import shooting_policy_figure
-from sim_bridge.experiments.hockey.shooting_comparison import Comparison, compare
 from sim_bridge.experiments.runs import (
     Execution,
     markdown_table,
@@ -23,6 +22,7 @@ from sim_bridge.experiments.runs import (
     success_interval,
     write_summary,
 )
+from sim_bridge.learn.shooting_comparison import Comparison, compare
 from vpsto_ros.contact.puck import SHIPPED as MODEL
 from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, Shot
@@ -46,7 +46,7 @@ def trial(task: tuple[int, str]) -> dict[str, list[Comparison]]:
     seed, path = task
     found = {}
     for setting in SETTINGS:
-        search, policy = searcher(setting), ShootingPolicy.load(setting, path)
+        search, policy = searcher(setting), ShootingPolicy.load(setting, *models(), path)
         rng = np.random.default_rng((_STREAM, seed))
         pucks = states(search, PUCKS, _CONFIG.fastest, rng)
         found[setting] = [compare(search, policy, puck, _CONFIG.covariance, rng) for puck in pucks]
@@ -54,10 +54,15 @@ def trial(task: tuple[int, str]) -> dict[str, list[Comparison]]:
 
 
 @functools.cache
+def models() -> tuple[PuckModel, StrikeTable]:
+    """Those of puck and arm that come with the package."""
+    return PuckModel.load(MODEL), StrikeTable.load()
+
+
+@functools.cache
 def searcher(setting: str) -> ShotSearch:
-    """Direct search with the models that come with the package."""
-    config = ShootingConfig(objective=SETTINGS[setting])
-    return ShotSearch(PuckModel.load(MODEL), StrikeTable.load(), config)
+    """Direct search with these."""
+    return ShotSearch(*models(), ShootingConfig(objective=SETTINGS[setting]))
 
 
 def warm_up() -> None:
@@ -78,9 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Compare; 0 when the policies are as good and as quick as wanted.
 
     Raises:
-        ConfigurationError: the file holds no policies.
+        ConfigurationError: the file holds no policies, or some of other settings, puck or arm.
     """
-    policies = {setting: ShootingPolicy.load(setting, arguments.policies) for setting in SETTINGS}
+    policies = {s: ShootingPolicy.load(s, *models(), arguments.policies) for s in SETTINGS}
     seeds = range(arguments.seed, arguments.seed + arguments.runs)
     tasks = [(seed, str(arguments.policies)) for seed in seeds]
     runs = run_trials(trial, tasks, Execution.from_arguments(arguments), "shooting_policy", warm_up)

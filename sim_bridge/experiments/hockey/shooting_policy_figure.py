@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.experiments.hockey.shooting_comparison import STEPS
 from sim_bridge.hockey.recordings import TABLE
+from sim_bridge.learn.shooting_comparison import STEPS
 from vpsto_ros.planning.hockey.shooting_config import SETTINGS
 from vpsto_ros.planning.hockey.shooting_policy import PolicySamples, ShootingPolicy
 from vpsto_ros.planning.hockey.shooting_search import ShotSearch

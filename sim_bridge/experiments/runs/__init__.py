@@ -3,11 +3,11 @@
 from sim_bridge.experiments.runs.execution import Execution, describe, run_trials
 from sim_bridge.experiments.runs.results import (
     markdown_table,
-    print_verdict,
     quantile,
     success_interval,
     write_summary,
 )
+from sim_bridge.verdict import print_verdict
 
 __all__ = [
     "Execution",

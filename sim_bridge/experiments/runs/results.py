@@ -39,13 +39,3 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         return f"| {' | '.join(padded)} |"
 
     return "\n".join([line(header), line(["-" * width for width in widths]), *map(line, rows)]) + "\n"
-
-
-def print_verdict(good: bool, text: str) -> int:
-    """Print the last line of an experiment: whether it reached its figures, and what it found.
-
-    Returns:
-        The exit status: 0 if it did, else 1.
-    """
-    print(f"verdict: {'passed' if good else 'FAILED'}: {text}")
-    return 0 if good else 1

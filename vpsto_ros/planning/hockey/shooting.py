@@ -66,6 +66,9 @@ class ShootingPlanner:
             config: options.
             policy: gives the angle at each contact time, instead of the grid.
             rng: for the policy's samples; a fixed one by default.
+
+        Raises:
+            ConfigurationError: puck and mallet of the model and of the strikes are not of the same size.
         """
         self.config, self._policy = config or ShootingConfig(), policy
         self._rng = rng if rng is not None else np.random.default_rng(0)

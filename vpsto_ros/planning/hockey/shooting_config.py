@@ -34,6 +34,10 @@ class Strikes(Protocol):
     def angle(self) -> NDArray[np.float64]:
         """Uniform grid of the direction of the mallet's velocity, from +x [rad]."""
 
+    @property
+    def contact_distance(self) -> float:
+        """Between the centres of puck and mallet when they touch [m]."""
+
     def speeds(self, puck: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Largest speeds (B,) [m/s] at places of the puck (B, 2) in directions (B,); 0 where none is."""
 
@@ -123,7 +127,7 @@ class Shot:
     goal_speed: float
     banks: int
     value: float
-    contact_distance: float = 0.0798
+    contact_distance: float
 
     @property
     def mallet(self) -> NDArray[np.float64]:

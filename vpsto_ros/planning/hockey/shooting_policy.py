@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vpsto_ros.contact.puck import PuckModel
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
-FORMAT = "vpsto_ros shooting policies 1"
+FORMAT = "vpsto_ros shooting policies 2"
 SHIPPED = pathlib.Path(__file__).parent / "models" / "shooting_policy.npz"
 """The policies of the three settings, which come with the package; their origin is in the file."""
 HIDDEN = 128
@@ -181,21 +184,34 @@ class ShootingPolicy:
         return angle, samples
 
     @classmethod
-    def load(cls, setting: str, path: str | pathlib.Path = SHIPPED) -> "ShootingPolicy":
+    def load(
+        cls, setting: str, model: PuckModel, strikes: StrikeTable, path: str | pathlib.Path = SHIPPED
+    ) -> "ShootingPolicy":
         """The policy of a setting from a file that :func:`save_policies` wrote.
 
+        Args:
+            setting: one of :data:`~vpsto_ros.planning.hockey.shooting_config.SETTINGS`.
+            model: of the puck that is shot at.
+            strikes: of the arm that shoots.
+            path: of the file.
+
         Raises:
-            ConfigurationError: there is no such file or setting, it is of another format, or its numbers are
-                no trained model.
+            ConfigurationError: there is no such file or setting, it is of another format, its numbers are no
+                trained model, or the policy was trained for another objective, puck or arm.
         """
         content = _read(path)
         origin = content.pop("origin")
-        if setting not in origin["settings"]:
+        if setting not in origin["settings"] or setting not in SETTINGS:
             known = ", ".join(origin["settings"])
             raise ConfigurationError(f"{path} has no policy for the setting {setting!r}; it has {known}")
         figures = origin["settings"][setting]
         if not figures.get("epochs"):
             raise ConfigurationError(f"the policy {setting!r} in {path} is not trained; {_REMEDY}")
+        strange = _differences(setting, figures, origin, model, strikes)
+        if strange:
+            raise ConfigurationError(
+                f"the policy {setting!r} in {path} was trained for {' and '.join(strange)}; {_REMEDY}"
+            )
         try:
             weights = {name: content[f"{setting}.{name}"].astype(np.float32) for name in LAYERS}
             low, high = (content[f"{setting}.{name}"].astype(float) for name in ("low", "high"))
@@ -205,23 +221,44 @@ class ShootingPolicy:
 
 
 def save_policies(
-    path: str | pathlib.Path, models: dict[str, EnergyModel], figures: dict[str, dict], **origin: Any
-) -> None:
-    """Write the models of several settings into one file.
+    path: str | pathlib.Path, models: dict[str, EnergyModel], figures: dict[str, dict], model: PuckModel,
+    strikes: StrikeTable, **origin: Any,
+) -> None:  # fmt: skip
+    """Write the models of several settings into one file, with what they were trained for.
 
     Args:
         path: of the file (npz).
-        models: by setting.
+        models: by setting, one of :data:`~vpsto_ros.planning.hockey.shooting_config.SETTINGS`.
         figures: of their training by setting, `epochs` among them.
+        model: of the puck that they were trained with.
+        strikes: of the arm, likewise.
         origin: where they come from (command, seed), for people.
     """
     arrays: dict[str, Any] = {}
-    for setting, model in models.items():
-        arrays |= {f"{setting}.{name}": model.weights[name] for name in LAYERS}
-        arrays |= {f"{setting}.low": model.low, f"{setting}.high": model.high}
-    header = json.dumps({"format": FORMAT, **origin, "settings": figures})
+    for setting, energy in models.items():
+        arrays |= {f"{setting}.{name}": energy.weights[name] for name in LAYERS}
+        arrays |= {f"{setting}.low": energy.low, f"{setting}.high": energy.high}
+    objectives = {setting: {"objective": dataclasses.asdict(SETTINGS[setting])} for setting in models}
+    settings = {setting: figures[setting] | objectives[setting] for setting in models}
+    made_for = {"puck_model": model.fingerprint, "strikes": strikes.fingerprint}
+    header = json.dumps({"format": FORMAT, **origin, **made_for, "settings": settings})
     with pathlib.Path(path).open("wb") as file:
         np.savez_compressed(file, header=np.array(header), **arrays)
+
+
+def _differences(
+    setting: str, figures: dict[str, Any], origin: dict[str, Any], model: PuckModel, strikes: StrikeTable
+) -> list[str]:
+    """For what else than what it is wanted for a policy was trained, in words."""
+    found, wanted = figures.get("objective"), dataclasses.asdict(SETTINGS[setting])
+    strange = []
+    if found != wanted:
+        strange.append(f"the objective {found}, not {wanted}")
+    if origin.get("puck_model") != model.fingerprint:
+        strange.append("another model of the puck")
+    if origin.get("strikes") != strikes.fingerprint:
+        strange.append("other strikes of the arm")
+    return strange
 
 
 def _read(path: str | pathlib.Path) -> dict[str, Any]:

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vpsto_ros.contact.puck import PuckModel, ShotOutlook
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot, Strikes
 
 _LEAST_CLOSING = 0.05  # slower mallets hardly touch [m/s]
+_SAME_DISTANCE = 1e-6  # between centres at the touch [m]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,7 +47,17 @@ class ShotSearch:
     """
 
     def __init__(self, model: PuckModel, strikes: Strikes, config: ShootingConfig) -> None:
-        """Lay out the grid."""
+        """Lay out the grid.
+
+        Raises:
+            ConfigurationError: puck and mallet of the model and of the strikes are not of the same size.
+        """
+        if abs(model.table.contact_distance - strikes.contact_distance) > _SAME_DISTANCE:
+            raise ConfigurationError(
+                f"centres of puck and mallet are {model.table.contact_distance:g} m apart at a touch by the "
+                f"model of the puck, {strikes.contact_distance:g} m by the strikes; `vpsto learn strikes` "
+                "makes strikes anew"
+            )
         self.model, self.strikes, self.config = model, strikes, config
         self.angles = np.linspace(strikes.angle[0], strikes.angle[-1], config.angles)
         self._distance = model.table.contact_distance

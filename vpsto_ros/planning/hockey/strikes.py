@@ -8,6 +8,7 @@ up and moved to the exact place.
 
 import dataclasses
 import functools
+import hashlib
 import itertools
 import json
 import math
@@ -126,6 +127,14 @@ class StrikeTable:
     def center(self) -> NDArray[np.float64]:
         """Where the table's centre is, in the robot's base frame, shape (2,) [m]."""
         return self.rules.table
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Of what shots are chosen by: speeds, their grids and the distance at the touch."""
+        digest = hashlib.sha256(np.float64(self.contact_distance).tobytes())
+        for array in (*self.grids, self.speed):
+            digest.update(array.tobytes())
+        return digest.hexdigest()
 
     def speeds(self, puck: ArrayLike, angles: ArrayLike) -> NDArray[np.float64]:
         """Largest mallet speeds (B,) [m/s] for pucks (B, 2) and angles (B,); 0 where there is no strike.
