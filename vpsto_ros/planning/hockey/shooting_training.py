@@ -27,7 +27,7 @@ class TrainingConfig:
     angle would break it.
     """
 
-    states: int = option(20_000, "puck states N", minimum=1, maximum=10**6)
+    states: int = option(40_000, "puck states N", minimum=1, maximum=10**6)
     actions: int = option(100, "angles per state M", minimum=2, maximum=10**4)
     fastest: float = option(1.0, "largest speed of these pucks", unit="m/s", minimum=0.0, maximum=5.0)
     position_std: float = option(
