@@ -1,5 +1,6 @@
 """The planners with the task shooting: shots from a puck's state, strikes from a contact plan."""
 
+import copy
 import dataclasses
 from pathlib import Path
 
@@ -161,6 +162,11 @@ def test_a_refused_shot_is_dropped_and_another_is_sought(shooter):
     shooter.advance(0.02, each=known(shooter))
     assert shooter.node.task.planner.committed.time == pytest.approx(chosen.time)
     message.header.stamp = SIMULATED.stamp(chosen.time)
+    elsewhere = copy.deepcopy(message)
+    elsewhere.pose.pose.position.y += 0.1
+    shooter.send("refused_contact", elsewhere)  # at the same time, but not this one
+    shooter.spin(0.05)
+    assert shooter.node.task.planner.committed is not None
     shooter.send("refused_contact", message)
     shooter.spin(0.05)
     assert shooter.node.complaints.counts["refused_contact"] == 1

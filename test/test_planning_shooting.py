@@ -10,8 +10,11 @@ from strikes_bench import START, StandInStrikes
 
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.estimation.puck_filter import PuckState
+from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.planning.hockey import shooting
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingConfig, ShootingPlanner
 from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy
+from vpsto_ros.planning.hockey.touch import SAME_TIME, same_touch
 
 MODEL = PuckModel.load(SHIPPED)
 NOISE = np.array([7e-4, 7e-4, 5e-3, 5e-3])
@@ -202,7 +205,89 @@ def test_a_refused_shot_is_not_chosen_again():
     assert agent.committed is None
     shots = run(agent, states[:12], begin=0.14)
     assert shots[-1] is not None
-    assert abs(shots[-1].time - refused.time) > 0.03 or abs(shots[-1].angle - refused.angle) > 0.15
+    assert not any(same_touch(s.time, s.mallet, refused.time, refused.mallet) for s in shots if s)
+
+
+def given_way():
+    """A planner whose shot has just given way to an earlier one, the shot of before, and the time."""
+    agent = planner(strikes=StandInStrikes(lead=2.0), clear_gain=0.05)
+    run(agent, course([-0.4, 0.1, 0.0, 0.0], 6))
+    agent.search.strikes = StandInStrikes(lead=0.5)
+    for k in range(7, 30):
+        before = agent.committed
+        agent.plan(PERIOD * k, state(PERIOD * k, [-0.4, 0.1, 0.0, 0.0]), START)
+        if before is not None and agent.committed.time < before.time - 0.5:
+            return agent, before, PERIOD * k
+    raise AssertionError("no shot gave way")
+
+
+def test_when_the_better_shot_is_refused_the_one_before_comes_back():
+    agent, before, _ = given_way()
+    better = agent.committed
+    agent.refuse()
+    assert agent.committed.time == before.time and agent.committed.time > better.time
+    # Refused as well, it is not brought back by itself, nor is the better one.
+    agent.refuse()
+    assert agent.committed is None
+    agent.refuse()
+    assert agent.committed is None
+
+
+def test_a_shot_that_is_over_does_not_come_back():
+    agent, before, now = given_way()
+    while now < before.time + 0.1:  # the better one is put off, as far as that
+        now += PERIOD
+        agent.committed = dataclasses.replace(agent.committed, time=now + 0.4)
+        agent.plan(now, state(now, [-0.4, 0.1, 0.0, 0.0]), START)
+        assert agent.committed is not None
+    agent.refuse()
+    assert agent.committed is None
+
+
+def test_a_shot_that_was_rejected_in_a_choice_does_not_come_back(monkeypatch):
+    """The best of a round turns out to be impossible, the next is chosen: refused, there is none before."""
+    agent, follow, rejected = planner(), ShootingPlanner._follow, []
+
+    def once(self, shot, now, puck):
+        if not rejected:
+            rejected.append(shot)
+            return "the puck will be elsewhere than where the shot was planned"
+        return follow(self, shot, now, puck)
+
+    monkeypatch.setattr(ShootingPlanner, "_follow", once)
+    for k in range(10):
+        if agent.plan(PERIOD * k, state(PERIOD * k, [-0.4, 0.1, 0.0, 0.0]), START) is not None:
+            break
+    assert rejected and agent.committed.time != rejected[0].time
+    agent.refuse()
+    assert agent.committed is None
+
+
+def test_as_many_refused_shots_are_remembered_as_promised():
+    agent = planner()
+    for k in range(60):
+        agent.plan(PERIOD * k, state(PERIOD * k, [-0.4, 0.1, 0.0, 0.0]), START)
+        if agent.committed is not None:
+            agent.refuse()
+    assert len(agent._barred) == shooting._REMEMBERED
+
+
+def test_the_same_touch_is_so_in_time_place_and_direction():
+    mallet = np.array([-0.5, 0.1, 1.0, 0.2])
+    turned = np.array([-0.5, 0.1, 1.0, -0.4])
+    aside = mallet + [0.0, 0.08, 0.0, 0.0]
+    assert same_touch(1.0, mallet, 1.01, mallet + [0.01, -0.02, 0.1, 0.05])
+    for time, other in ((1.0 + SAME_TIME, mallet), (1.0, turned), (1.0, aside)):
+        assert not same_touch(1.0, mallet, time, other) and not same_touch(time, other, 1.0, mallet)
+    # Directions are compared across the seam at 180 degrees.
+    back = mallet * [1.0, 1.0, -1.0, 0.05]
+    assert same_touch(1.0, back, 1.0, back * [1.0, 1.0, 1.0, -1.0])
+
+
+def test_contact_times_are_farther_apart_than_those_of_the_same_touch():
+    with pytest.raises(ConfigurationError, match=r"time_step.*more than 0\.02"):
+        ShootingConfig(time_step=SAME_TIME)
+    assert ShootingConfig(time_step=1.01 * SAME_TIME).time_step > SAME_TIME
 
 
 def test_searching_in_parts_finds_what_a_whole_round_finds():

@@ -397,6 +397,7 @@ def test_a_contact_told_anew_is_the_same_one():
     assert turned.continues(contact) and not turned.continues(None)
     assert not MalletContact(11.1, contact.mallet).continues(contact)
     assert not MalletContact(11.0, contact.mallet * [1, 1, 0.5, 1] + [0, 0, 0, 1.0]).continues(contact)
+    assert not MalletContact(11.0, contact.mallet + [0.0, 0.08, 0.0, 0.0]).continues(contact)
     # Directions are compared across the seam at 180 degrees.
     back = [MalletContact(0.0, np.array([0.0, 0.0, -1.0, side])) for side in (0.01, -0.01)]
     assert back[0].continues(back[1])

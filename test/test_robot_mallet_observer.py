@@ -61,6 +61,16 @@ def test_a_gap_hangs_it_up_and_an_old_measurement_changes_nothing():
     np.testing.assert_array_equal(observer.observe(stamp + 1.01 * LONGEST_GAP, q, qd), fresh)
 
 
+def test_a_clock_that_is_set_back_begins_anew():
+    """The swing does not freeze until the clock is where it was."""
+    rows, observer, fresh = swung(), MalletObserver(), MalletObserver()
+    for stamp, q, qd, *_ in rows[:40]:
+        observer.observe(stamp, q, qd)
+    assert stamp > LONGEST_GAP + 0.2
+    for stamp, q, qd, *_ in rows[10:40]:
+        np.testing.assert_array_equal(observer.observe(stamp - 0.2, q, qd), fresh.observe(stamp - 0.2, q, qd))
+
+
 def test_broken_joints_are_named():
     for q, qd in ((np.zeros(6), np.zeros(7)), (np.zeros(7), np.full(7, np.nan))):
         with pytest.raises(InvalidInputError, match="7 positions"):

@@ -97,7 +97,9 @@ def test_worlds_differ_from_the_nominal_one_within_the_spread():
 def test_settings_are_those_of_the_thesis_and_one_that_must_use_a_rim():
     assert {name: OBJECTIVES[name] for name in SETTINGS} == SETTINGS
     assert OBJECTIVES["forced_bank"].least_banks == 1 and config("moving") == config("conservative")
-    assert set(SCORES) == set(OBJECTIVES)
+    thesis = dataclasses.replace(SETTINGS["aggressive"], beta=0.5)
+    assert OBJECTIVES["aggressive_thesis"] == thesis and thesis.lambda1 == 0.0
+    assert set(SCORES) == set(OBJECTIVES) - {"aggressive_thesis"}, "which is only compared with"
 
 
 def test_the_baseline_prefers_the_middle_of_the_goal_and_no_rims():

@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker
 from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.nodes import markers
 from vpsto_ros.nodes.contact_planner_config import OWN_SETTING, ContactPlannerNodeConfig
-from vpsto_ros.nodes.conversions import contact_message, read_state, withdrawal_message
+from vpsto_ros.nodes.conversions import contact_message, read_contact, read_state, withdrawal_message
 from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.puck_estimator import puck_model
@@ -21,10 +21,9 @@ from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingPlanner, Shot
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
 from vpsto_ros.planning.hockey.shot_preview import ShotPreview, preview
 from vpsto_ros.planning.hockey.strikes import StrikeTable
+from vpsto_ros.planning.hockey.touch import same_touch
 from vpsto_ros.robot.iiwa import iiwa14
 
-SAME_SHOT = 0.02
-"""A refused contact whose time differs by less is the chosen shot's [s]."""
 _LEAST_VARIANCE = 1e-8  # of where to touch, so that the covariance stays positive definite [m²]
 _DOTS = 3  # every so many states of the puck's way get an ellipse
 
@@ -127,8 +126,10 @@ class ShootingContacts:
 
     def _receive_refusal(self, message: Odometry) -> None:
         """Drop a shot that the arm has no motion for; what comes later is another one."""
-        time, shot = self._node.seconds(message.header.stamp, CONTACT_AHEAD), self.planner.committed
-        if shot is not None and abs(time - shot.time) < SAME_SHOT:
+        self._node.seconds(message.header.stamp, CONTACT_AHEAD)
+        plan = read_contact(message, self._node.time_base, self._config.base_frame)
+        mallet, shot = np.append(self._table.to_table(plan.position), plan.velocity), self.planner.committed
+        if shot is not None and same_touch(plan.stamp, mallet, shot.time, shot.mallet):
             self.planner.refuse()
             words = "the arm has no motion for the shot; another is sought"
             self._node.complaints.add("refused_contact", words)

@@ -9,7 +9,10 @@ from vpsto_ros.robot.mallet_tilt import MalletTilt
 from vpsto_ros.trajectory import Trajectory
 
 LONGEST_GAP = 0.1
-"""Between two measurements; after a longer one the mallet is taken to hang vertically [s]."""
+"""Between two measurements; after a longer one the mallet is taken to hang vertically [s].
+
+So it is when time goes back by more: the clock was set back.
+"""
 _SHORTEST_GAP = 1e-6
 
 
@@ -35,7 +38,7 @@ class MalletObserver:
         """Take in measured joints.
 
         Args:
-            stamp: when they were measured [s]; one that is not newer than the last changes nothing.
+            stamp: when they were measured [s]; one that is a little older than the last changes nothing.
             position: of the joints, shape (7,) [rad].
             velocity: of the joints, shape (7,) [rad/s].
 
@@ -56,7 +59,7 @@ class MalletObserver:
 
     def _follow(self, stamp: float, q: NDArray, qd: NDArray) -> None:
         """Let the mallet swing on since the last measurement."""
-        if self._last is None or stamp - self._last[0] > LONGEST_GAP:
+        if self._last is None or abs(stamp - self._last[0]) > LONGEST_GAP:
             self._swing = np.zeros(4)
         elif stamp - self._last[0] < _SHORTEST_GAP:
             return

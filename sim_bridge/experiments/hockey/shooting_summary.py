@@ -12,7 +12,11 @@ from sim_bridge.experiments.hockey.shooting_trials import ShotResult
 from sim_bridge.experiments.runs import markdown_table, success_interval
 
 SCORES = {"conservative": 0.97, "balanced": 0.92, "aggressive": 0.80, "forced_bank": 0.65, "moving": 0.90}
-"""Shares of shots that are to score, by player."""
+"""Shares of shots that are to score, by player.
+
+There is none for "aggressive_thesis", which takes shots that are just likely enough: it is there to
+compare with.
+"""
 SPEEDS = {"conservative": 1.3, "balanced": 1.44, "aggressive": 1.6, "forced_bank": 1.3}
 """Mean speeds at the goal line that are to be reached [m/s]."""
 STEP_P99, STEP_MAX = 10.0, 20.0

@@ -20,6 +20,7 @@ from vpsto_ros.planning.hockey.shooting_config import (
 from vpsto_ros.planning.hockey.shooting_policy import PolicySamples, ShootingPolicy
 from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
 from vpsto_ros.planning.hockey.shooting_times import ContactTimes, Round
+from vpsto_ros.planning.hockey.touch import same_touch
 
 __all__ = ["SETTINGS", "ShootingConfig", "ShootingObjective", "ShootingPlanner", "Shot", "Strikes"]
 
@@ -29,7 +30,6 @@ STRUCK = "the puck has just been struck"
 """Why there is no shot for a moment after a touch."""
 _CAUTION = 1.15  # factor on the time that the arm is said to need, for every shot that it refuses
 _MOST_CAUTION = 2.0
-_ALIKE = (0.03, 0.15)  # times [s] and directions [rad] of shots that are much alike
 _REMEMBERED = 8  # shots that were refused
 _SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
 _TURNS = np.array([0.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0])  # of a chosen angle in a step, of the largest
@@ -83,20 +83,23 @@ class ShootingPlanner:
     def _drop(self, reason: str) -> None:
         """Let go of the shot, and of what the search has found."""
         self.committed, self.reason = None, reason
-        self._before: Shot | None = None
+        self._before: Shot | None = None  # what gave way to the chosen shot
         self._share = 1.0  # of the largest speed that the chosen shot has
         self._round: Round | None = None
         self._samples: PolicySamples | None = None
         self._found_wrong = ""  # with what the last round has found
 
     def refuse(self) -> None:
-        """The arm cannot do the chosen shot: back to the one before, if any, and never that again."""
+        """The arm cannot do the chosen shot: back to the one that gave way to it, and never that again.
+
+        One that is over or that was refused itself does not come back.
+        """
         shot, before = self.committed, self._before
         self._drop(SEARCHING)
         if shot is not None:
-            self._barred = [*self._barred[-_REMEMBERED:], shot]
+            self._barred = [*self._barred, shot][-_REMEMBERED:]
             self._times.caution = min(_MOST_CAUTION, _CAUTION * self._times.caution)
-        if before is not None:
+        if before is not None and before.time > self._now and not self._is_barred(before):
             self._commit(before)
 
     def plan(self, now: float, puck: PuckState | None, joints: ArrayLike) -> Shot | None:
@@ -221,8 +224,10 @@ class ShootingPlanner:
         shot = self._times.advance(current, now, puck, joints)
         if shot is not None and self.search.taken(shot) and not self._is_barred(shot):
             current.shots.append(shot)
-            if self.committed is not None and self._clearly_better(shot, self.committed):
+            before = self.committed
+            if before is not None and self._clearly_better(shot, before):
                 self._commit(shot)
+                self._before = before
         if current.times.size:
             if self.committed is None:
                 self.reason = self._found_wrong or SEARCHING
@@ -252,14 +257,11 @@ class ShootingPlanner:
         self._found_wrong = reason
 
     def _is_barred(self, shot: Shot) -> bool:
-        """Whether it is much like one that the arm has refused."""
-        return any(
-            abs(shot.time - other.time) < _ALIKE[0] and abs(shot.angle - other.angle) < _ALIKE[1]
-            for other in self._barred
-        )
+        """Whether it is one that the arm has refused."""
+        return any(same_touch(shot.time, shot.mallet, bad.time, bad.mallet) for bad in self._barred)
 
     def _commit(self, shot: Shot) -> None:
-        self._before = self.committed
+        self._before = None
         largest = float(self.search.speeds(shot.puck[None, :2], np.array([shot.angle]))[0])
         self._share = shot.speed / largest if largest > 0.0 else 1.0
         self.committed, self.reason, self._samples = shot, "", None

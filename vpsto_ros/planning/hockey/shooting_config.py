@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.contact.puck import ShotOutlook
 from vpsto_ros.exceptions import ConfigurationError
+from vpsto_ros.planning.hockey.touch import SAME_TIME
 
 _MISSING = 2.0  # price of a missing chance, in units of the objective
 
@@ -162,7 +163,10 @@ class ShootingConfig:
     speed_std: float = option(
         0.05, "standard deviation of the mallet's speed", unit="m/s", minimum=0.0, maximum=1.0
     )
-    time_step: float = option(0.05, "between contact times", unit="s", minimum=0.005, maximum=1.0)
+    time_step: float = option(
+        0.05, f"between contact times, more than {SAME_TIME:g}: at less they are one", unit="s",
+        minimum=0.005, maximum=1.0,
+    )  # fmt: skip
     latest: float = option(2.5, "how far ahead the last contact time is", unit="s", minimum=0.1, maximum=10.0)
     times_per_step: int = option(
         8, "contact times that a step of the planner searches; a round takes several steps", minimum=1,
@@ -227,3 +231,8 @@ class ShootingConfig:
 
     def __post_init__(self) -> None:
         validate(self)
+        if self.time_step <= SAME_TIME:
+            raise ConfigurationError(
+                f"ShootingConfig.time_step = {self.time_step!r} is not allowed; expected more than"
+                f" {SAME_TIME:g} s, within which contacts count as the same"
+            )

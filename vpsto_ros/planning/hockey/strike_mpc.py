@@ -17,6 +17,7 @@ from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion, way_in
 from vpsto_ros.planning.hockey.strikes import Cell, StrikeTable
+from vpsto_ros.planning.hockey.touch import same_touch
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import extended, resting
@@ -24,9 +25,6 @@ from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.robot.mallet_tilt import MalletTilt
 from vpsto_ros.trajectory import Trajectory
-
-_SAME = 0.02  # contacts whose times differ by less are the same, told anew [s]
-_SAME_ANGLE = 0.35  # and whose directions do [rad]
 
 
 @documented
@@ -125,10 +123,7 @@ class MalletContact:
 
     def continues(self, other: "MalletContact | None") -> bool:
         """Whether it is another one, told anew."""
-        if other is None or abs(self.time - other.time) > _SAME:
-            return False
-        turned = (self.angle - other.angle + np.pi) % (2.0 * np.pi) - np.pi
-        return bool(abs(turned) < _SAME_ANGLE)
+        return other is not None and same_touch(self.time, self.mallet, other.time, other.mallet)
 
 
 _Planned = tuple[Trajectory, MalletContact, Cell, Trajectory | None, Trajectory | None]
