@@ -29,14 +29,12 @@ from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.contact.pushing import PushingModel, push_directions
 from vpsto_ros.estimation.particle_filter import ObjectParticleFilter
 from vpsto_ros.estimation.particle_filter_config import ParticleFilterConfig
-from vpsto_ros.estimation.puck_filter import PuckFilter, PuckState
+from vpsto_ros.estimation.puck_filter import PuckFilter
 from vpsto_ros.optimization.costs import JointSpaceProblem
 from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
-from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.planning.hockey.shooting import ShootingPlanner
-from vpsto_ros.planning.hockey.shot_preview import preview
-from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
 from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
@@ -53,7 +51,7 @@ def run(_arguments: argparse.Namespace | None = None) -> int:
     """
     began = time.perf_counter()
     pushing = push_a_box, move_two_arms, track_a_pushed_can, push_by_a_belief
-    hockey = predict_a_puck, plan_a_shot, play_air_hockey
+    hockey = predict_a_puck, play_air_hockey
     for use in (*pushing, *hockey, evaluate_a_trajectory, plan_in_clutter, plan_in_a_cell):
         use()
     print(f"kernels ready after {time.perf_counter() - began:.1f} s")
@@ -106,32 +104,15 @@ def predict_a_puck() -> None:
     model.shots(start, spread, start[None] - [model.table.contact_distance, 0.0, 0.0, 0.0])
     model.goal_window(0.1)
     model.simulate(start[None], 3, np.random.default_rng(0))
-    tracker = PuckFilter(model)
-    for step in range(12):
-        tracker.observe_mallet(0.01 * step, np.array([-0.3, 0.0]), np.array([0.5, 0.0]))
-        tracker.update(0.01 * step, np.array([-0.2 + 0.002 * step, 0.0]))
-    tracker.state(0.5)
-
-
-def plan_a_shot() -> None:
-    """Contact planning at the air-hockey table."""
-    strikes, home = StrikeTable.load(), np.array(PlayRules().home)
-    planner = ShootingPlanner(PuckModel.load(SHIPPED), strikes)
-    puck = PuckState(0.0, np.array([-0.4, 0.1, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
-    planner.plan(0.0, puck, home)
+    PuckFilter(model).warm_up()
 
 
 def play_air_hockey() -> None:
-    """A shot that is chosen and looked at, a strike in the simulated world, rules and mallet watched."""
-    model, strikes = PuckModel.load(SHIPPED), StrikeTable.load()
-    planner, mpc, home = ShootingPlanner(model, strikes), StrikeMpc(strikes), np.array(strikes.rules.home)
-    for step in range(30):
-        puck = PuckState(0.02 * step, np.array([-0.5, 0.0, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
-        shot = planner.plan(0.02 * step, puck, home)
-    preview(model, planner.config, puck, shot)
-    contact = MalletContact(2.0, np.array([-0.58, 0.0, 0.9, 0.0]))
-    for step in range(4):
-        mpc.accept(mpc.step(0.02 * step, home, np.zeros(7), contact if step else None))
+    """Shots are chosen, the arm strikes, in the simulated world rules and mallet are watched."""
+    strikes = StrikeTable.load()
+    home = np.array(strikes.rules.home)
+    ShootingPlanner(PuckModel.load(SHIPPED), strikes).warm_up(home)
+    StrikeMpc(strikes).warm_up()
     observer = MalletObserver()
     for step in range(3):
         observer.observe(0.01 * step, home + 0.001 * step, np.full(7, 0.1))

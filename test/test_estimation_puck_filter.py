@@ -462,3 +462,12 @@ def test_while_a_contact_lasts_no_velocity_counts():
     outcome = estimator.observe_velocity([0.0, 1.5])
     assert outcome.kind == "outlier" and "contact" in outcome.reason
     np.testing.assert_array_equal(estimator.state(stamp).mean, before.mean)
+
+
+def test_a_warm_up_meets_mallet_and_wall_and_forgets_it(monkeypatch):
+    tracker, contacts = PuckFilter(model()), []
+    state = PuckFilter.state
+    monkeypatch.setattr(PuckFilter, "state", lambda self, at: contacts.append(state(self, at).contacts))
+    tracker.warm_up()
+    monkeypatch.undo()
+    assert contacts[0] >= 2 and tracker.state(1.0) is None

@@ -13,7 +13,9 @@ from vpsto_ros.estimation.puck_filter import PuckState
 from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.planning.hockey import shooting
 from vpsto_ros.planning.hockey.shooting import SETTINGS, ShootingConfig, ShootingPlanner
+from vpsto_ros.planning.hockey.shooting_config import middle_strike
 from vpsto_ros.planning.hockey.shooting_policy import EnergyModel, ShootingPolicy
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.hockey.touch import SAME_TIME, same_touch
 
 MODEL = PuckModel.load(SHIPPED)
@@ -472,3 +474,22 @@ def test_what_the_policy_proposes_must_keep_the_chance_constraint():
     agent = ShootingPlanner(MODEL, StandInStrikes(), None, ShootingPolicy(wedge(0.35)))
     shots = run(agent, course([-0.4, 0.1, 0.0, 0.0], 40))
     assert all(shot is None for shot in shots) and "scores with probability" in agent.reason
+
+
+@pytest.mark.parametrize("strikes", [StandInStrikes(), StrikeTable.load()])
+def test_a_warm_up_chooses_a_shot_and_forgets_it(strikes, monkeypatch):
+    agent, shots = planner(strikes=strikes), []
+    plan = ShootingPlanner.plan
+    monkeypatch.setattr(ShootingPlanner, "plan", lambda *arguments: shots.append(plan(*arguments)))
+    agent.warm_up(START)
+    assert shots[-1] is not None and shots[-1].goal > 0.5
+    assert agent.committed is None and agent.reason
+
+
+def test_an_arm_that_strikes_nowhere_straight_ahead_says_so():
+    strikes = StandInStrikes(slowest=0.0)
+    with pytest.raises(ConfigurationError, match="straight ahead"):
+        middle_strike(strikes)
+    place, speed = middle_strike(StandInStrikes())
+    np.testing.assert_allclose(place, [-0.45, 0.0])
+    assert speed == pytest.approx(1.2 * 0.875)

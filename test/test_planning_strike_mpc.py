@@ -406,3 +406,17 @@ def test_a_contact_told_anew_is_the_same_one():
 def test_options_out_of_range_are_named():
     with pytest.raises(ConfigurationError, match="longest"):
         StrikeMpcConfig(longest=0.0)
+
+
+def test_a_warm_up_strikes_goes_home_and_leaves_nothing(monkeypatch):
+    mpc, wanted = StrikeMpc(StrikeTable.load()), []
+    accept = StrikeMpc.accept
+
+    def watched(self, step):
+        accept(self, step)
+        wanted.append(self.contact)
+
+    monkeypatch.setattr(StrikeMpc, "accept", watched)
+    mpc.warm_up()
+    assert wanted[0] is None and wanted[1] is not None and wanted[-1] is None
+    assert mpc.contact is None and mpc.reference is None

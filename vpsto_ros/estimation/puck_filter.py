@@ -139,6 +139,15 @@ class PuckFilter:
         self._pending: list[_Sighting] = []
         self.distance: float | None = None
 
+    def warm_up(self) -> None:
+        """Compile whatever estimates use: let an imaginary puck rest, be hit and bounce; then forget it."""
+        reach = self.model.table.contact_distance
+        for stamp in 0.01 * np.arange(12):
+            self.observe_mallet(float(stamp), np.array([-reach - 0.01, 0.0]), np.array([0.5, 0.0]))
+            self.update(float(stamp), np.array([-0.2 * stamp, 0.0]))
+        self.state(1.0)
+        self.reset()
+
     def update(self, stamp: float, position: ArrayLike, covariance: ArrayLike | None = None) -> Outcome:
         """Take in a measured position.
 

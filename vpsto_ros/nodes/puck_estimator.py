@@ -17,6 +17,7 @@ from vpsto_ros.nodes.estimators import Bridging
 from vpsto_ros.nodes.joint_conversions import read_joint_state
 from vpsto_ros.nodes.lifecycle import ManagedNode
 from vpsto_ros.nodes.table_frame import HockeyTableConfig
+from vpsto_ros.planning.hockey.rules import PlayRules
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.mallet_observer import MalletObserver
 from vpsto_ros.robot.mallet_tilt import MalletTilt
@@ -107,13 +108,8 @@ class PuckEstimator:
         return {"contacts": state.contacts, "touching": state.touching or "nothing"}
 
     def _warm_up(self) -> None:
-        """Let an imaginary puck rest, be hit and bounce."""
-        joints = np.array([0.0, -0.196, 0.0, -1.844, 0.0, 0.970, 0.0])
+        """Compile whatever a puck and a mallet use."""
         for index in range(4):
-            self.move(0.01 * index, joints, np.zeros(7))
-        here = self._mallet.observe(0.05, joints, np.zeros(7))[:2] + np.array([0.09, 0.0])
-        for index in range(12):
-            stamp, pose = 0.1 + 0.01 * index, np.array([*here - 0.002 * index, 0.0])
-            self._filter.observe_mallet(stamp, self._table.to_table(here - 0.09), np.array([0.5, 0.0]))
-            self.update(stamp, pose, 1e-6 * np.eye(3))
-        self._filter.state(1.0)
+            self.move(0.01 * index, np.array(PlayRules().home), np.zeros(7))
+        self._filter.reset()
+        self._filter.warm_up()

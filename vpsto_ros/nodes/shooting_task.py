@@ -41,7 +41,7 @@ class ShootingContacts:
         self._model = puck_model(config.puck_model)
         policy = ShootingPolicy.load(config.setting, self._model, strikes) if config.policy else None
         self.planner = ShootingPlanner(self._model, strikes, shooting, policy)
-        self._warm_up(np.array(strikes.rules.home))
+        self.planner.warm_up(strikes.rules.home)
         self.forget()
         self._chances = node.advertise(Float64, "~/goal_probability", reliable(1))
         node.subscribe(Odometry, "object_state", self._receive_object)
@@ -133,13 +133,6 @@ class ShootingContacts:
             self.planner.refuse()
             words = "the arm has no motion for the shot; another is sought"
             self._node.complaints.add("refused_contact", words)
-
-    def _warm_up(self, home: NDArray) -> None:
-        """Compile whatever shots use: a round over all contact times, and a look at the result."""
-        puck = PuckState(0.0, np.array([-0.5, 0.0, 0.0, 0.0]), 1e-6 * np.eye(4), 0, "")
-        for index in range(30):
-            shot = self.planner.plan(0.02 * index, dataclasses.replace(puck, stamp=0.02 * index), home)
-            preview(self._model, self.planner.config, puck, shot)
 
     def markers(self, make: markers.MarkerFactory) -> list[Marker]:
         """The way of the puck that is expected, and the shot with ellipses of two standard deviations."""

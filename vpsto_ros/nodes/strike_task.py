@@ -36,7 +36,7 @@ class StrikeTask:
         strikes = StrikeTable.load()
         self._node, self._config, self._table = node, config, config.hockey.table(strikes)
         self.planner = StrikeMpc(strikes, config.strike, seed=config.seed)
-        self._warm_up()
+        self.planner.warm_up()
         self.forget()
         self._refusals = node.advertise(Odometry, "refused_contact", reliable(5))
         node.subscribe(Odometry, "contact_plan", self._receive)
@@ -97,15 +97,3 @@ class StrikeTask:
         mallet = np.concatenate([self._table.to_table(plan.position), plan.velocity])
         self.contact = MalletContact(plan.stamp, mallet)
         self._received, self._message = self._node.clock_seconds(), message
-
-    def _warm_up(self) -> None:
-        """Compile whatever a strike uses: wait at home, strike, return."""
-        planner = self.planner
-        q, still = planner.home, np.zeros(7)
-        contact = MalletContact(2.0, np.array([-0.58, 0.0, 0.9, 0.0]))
-        for index in range(4):
-            planner.accept(planner.step(0.02 * index, q, still, contact if index else None))
-        assert planner.contact is not None, "the arm can do this"
-        planner.accept(planner.step(0.1, q, still, None))
-        planner.stop(0.12)
-        planner.reset()

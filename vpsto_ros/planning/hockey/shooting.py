@@ -16,6 +16,7 @@ from vpsto_ros.planning.hockey.shooting_config import (
     ShootingObjective,
     Shot,
     Strikes,
+    middle_strike,
 )
 from vpsto_ros.planning.hockey.shooting_policy import PolicySamples, ShootingPolicy
 from vpsto_ros.planning.hockey.shooting_search import ShotSearch, Strokes
@@ -91,6 +92,18 @@ class ShootingPlanner:
         self._round: Round | None = None
         self._samples: PolicySamples | None = None
         self._found_wrong = ""  # with what the last round has found
+
+    def warm_up(self, joints: ArrayLike) -> None:
+        """Compile whatever shots use: a round over all contact times for an imaginary puck, then forget it.
+
+        Args:
+            joints: posture of the arm that waits, shape (7,) [rad].
+        """
+        place, _ = middle_strike(self.search.strikes)
+        mean, steps = np.append(place, np.zeros(2)), 2 + len(self._times.begin(0.0).times)
+        for now in 0.02 * np.arange(steps):
+            self.plan(float(now), PuckState(float(now), mean, 1e-6 * np.eye(4), 0, ""), joints)
+        self.forget()
 
     def refuse(self) -> None:
         """The arm cannot do the chosen shot: back to the one that gave way to it, and never that again.

@@ -48,6 +48,24 @@ class Strikes(Protocol):
         """Largest speeds (B,) [m/s] that can be had from a posture at rest (7,) in the times (B,) [s]."""
 
 
+def middle_strike(strikes: Strikes) -> tuple[NDArray[np.float64], float]:
+    """A strike straight ahead as near to the middle of the grid as there is one.
+
+    Returns:
+        The puck's place, table frame, shape (2,) [m]; the largest speed of the mallet there [m/s].
+
+    Raises:
+        ConfigurationError: the arm can strike straight ahead nowhere.
+    """
+    places = np.stack(np.meshgrid(strikes.x, strikes.y, indexing="ij"), axis=-1).reshape(-1, 2)
+    speeds = strikes.speeds(places, np.zeros(len(places)))
+    if not speeds.any():
+        raise ConfigurationError("strikes: there is none straight ahead")
+    away = np.linalg.norm(places - places.mean(axis=0), axis=1)
+    best = int(np.argmin(np.where(speeds > 0.0, away, np.inf)))
+    return places[best], float(speeds[best])
+
+
 @documented
 @dataclasses.dataclass(frozen=True)
 class ShootingObjective:

@@ -16,6 +16,7 @@ from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion, way_in
+from vpsto_ros.planning.hockey.shooting_config import middle_strike
 from vpsto_ros.planning.hockey.strikes import Cell, StrikeTable
 from vpsto_ros.planning.hockey.touch import same_touch
 from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
@@ -215,6 +216,16 @@ class StrikeMpc(ReferencePlanner):
         if self.contact is not None and contact is None and self.contact.time > takeover + self.config.final:
             return self._withdraw(now, takeover)
         return self._go_on(now)
+
+    def warm_up(self) -> None:
+        """Compile what a strike of the table uses: wait at home, strike, go home; then forget it."""
+        place, speed = middle_strike(self.table)
+        mallet = np.array([place[0] - self.table.contact_distance, place[1], 0.8 * speed, 0.0])
+        contact, still = MalletContact(self.config.longest + 0.4, mallet), np.zeros(7)
+        for now, wanted in ((0.0, None), (0.02, contact), (0.04, contact), (0.06, None)):
+            self.accept(self.step(now, self.home, still, wanted))
+        self.stop(0.08)
+        self.reset()
 
     def accept(self, step: MpcStep) -> None:
         """Take note that a step's trajectory is being executed."""
