@@ -35,7 +35,8 @@ from vpsto_ros.optimization.terms import position_extrema
 from vpsto_ros.optimization.vpsto import VpstoConfig, search
 from vpsto_ros.planning.hockey.shooting import ShootingPlanner
 from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
-from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
+from vpsto_ros.planning.hockey.strike_tabulation import tabulate
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.planning.joint_space_problem import JointSpaceMpcConfig
 from vpsto_ros.robot.kinematics import fr3_pusher
 from vpsto_ros.robot.mallet_observer import MalletObserver

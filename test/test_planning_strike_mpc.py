@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
-from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc, StrikeMpcConfig
+from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
+from vpsto_ros.planning.hockey.strike_mpc_config import StrikeMpcConfig
 from vpsto_ros.planning.hockey.strikes import StrikeTable
+from vpsto_ros.planning.hockey.touch import MalletContact
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.trajectory import Limits

@@ -9,7 +9,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 from vpsto_ros.exceptions import ConfigurationError, InvalidInputError
 from vpsto_ros.planning.hockey.rules import PlayRules
-from vpsto_ros.planning.hockey.strikes import SHIPPED, StrikeConfig, StrikeTable, tabulate
+from vpsto_ros.planning.hockey.strike_tabulation import tabulate
+from vpsto_ros.planning.hockey.strikes import SHIPPED, StrikeConfig, StrikeTable
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.trajectory import Trajectory

@@ -10,8 +10,9 @@ from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand
 from vpsto_ros.contact.puck import SHIPPED, PuckModel
 from vpsto_ros.planning.hockey.agent import HockeyAgent, Observation, PuckSighting
-from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
 from vpsto_ros.planning.hockey.strikes import StrikeTable
+from vpsto_ros.planning.hockey.touch import MalletContact
 from vpsto_ros.robot.iiwa import JOINT_NAMES
 
 TABLE, MODEL = StrikeTable.load(), PuckModel.load(SHIPPED)

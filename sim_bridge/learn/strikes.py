@@ -10,7 +10,8 @@ from tqdm import tqdm
 from sim_bridge.cli import count
 from sim_bridge.hockey.recordings import TABLE
 from sim_bridge.verdict import print_verdict
-from vpsto_ros.planning.hockey.strikes import StrikeTable, tabulate
+from vpsto_ros.planning.hockey.strike_tabulation import tabulate
+from vpsto_ros.planning.hockey.strikes import StrikeTable
 
 X = np.linspace(-0.75, -0.10, 14)
 Y = np.linspace(-0.44, 0.44, 17)

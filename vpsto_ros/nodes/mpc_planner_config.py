@@ -18,7 +18,7 @@ from vpsto_ros.nodes.scene import ModelConfig
 from vpsto_ros.nodes.table_frame import PlayingSurfaceConfig
 from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.belief_space.config import RobustMpcConfig
-from vpsto_ros.planning.hockey.strike_mpc import StrikeMpcConfig
+from vpsto_ros.planning.hockey.strike_mpc_config import StrikeMpcConfig
 from vpsto_ros.planning.pushing_config import PushingMpcConfig
 
 TRANSPORT = 0.004

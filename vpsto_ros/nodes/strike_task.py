@@ -14,8 +14,9 @@ from vpsto_ros.nodes.inputs import CONTACT_AHEAD
 from vpsto_ros.nodes.lifecycle import ManagedNode, reliable
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.nodes.table_frame import MALLET
-from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc
+from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
 from vpsto_ros.planning.hockey.strikes import StrikeTable
+from vpsto_ros.planning.hockey.touch import MalletContact
 from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.planning.stitching import extended
 from vpsto_ros.robot.iiwa_kinematics import arm_points

@@ -23,8 +23,10 @@ from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.planning.hockey.shooting import ShootingPlanner
 from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
-from vpsto_ros.planning.hockey.strike_mpc import MalletContact, StrikeMpc, StrikeMpcConfig
+from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
+from vpsto_ros.planning.hockey.strike_mpc_config import StrikeMpcConfig
 from vpsto_ros.planning.hockey.strikes import StrikeTable
+from vpsto_ros.planning.hockey.touch import MalletContact
 from vpsto_ros.planning.running_reference import MpcStep
 from vpsto_ros.planning.stitching import extended
 from vpsto_ros.robot.mallet_observer import MalletObserver

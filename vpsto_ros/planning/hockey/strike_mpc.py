@@ -12,120 +12,18 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vpsto_ros.configuration import documented, option, validate
 from vpsto_ros.exceptions import InfeasibleError, InvalidInputError
-from vpsto_ros.optimization.vpsto import VpstoConfig
 from vpsto_ros.planning.hockey.motions import ArmState, Play, PlayMotion, way_in
 from vpsto_ros.planning.hockey.shooting_config import middle_strike
+from vpsto_ros.planning.hockey.strike_mpc_config import StrikeMpcConfig
 from vpsto_ros.planning.hockey.strikes import Cell, StrikeTable
-from vpsto_ros.planning.hockey.touch import same_touch
-from vpsto_ros.planning.mpc import OnlineConfig, OnlineResult, OnlineVpsto
+from vpsto_ros.planning.hockey.touch import MalletContact
+from vpsto_ros.planning.mpc import OnlineResult, OnlineVpsto
 from vpsto_ros.planning.running_reference import AT_REST, MpcStep, ReferencePlanner
 from vpsto_ros.planning.stitching import extended, resting
 from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
-from vpsto_ros.robot.mallet_tilt import MalletTilt
 from vpsto_ros.trajectory import Trajectory
-
-
-@documented
-@dataclasses.dataclass(frozen=True)
-class StrikeMpcConfig:
-    """Options of the planner.
-
-    Raises:
-        ConfigurationError: a value is out of range; the message names what is allowed.
-    """
-
-    lead: float = option(
-        0.02, "time from the start of planning to the moment a plan takes over", unit="s", minimum=0.0,
-        maximum=0.2,
-    )  # fmt: skip
-    longest: float = option(
-        1.6, "a motion into a touch begins at most so long before it", unit="s", minimum=0.2, maximum=5.0
-    )
-    least: float = option(
-        0.04, "so shortly before the touch the motion is not planned anew", unit="s", minimum=0.0, maximum=0.5
-    )
-    final: float = option(
-        0.1, "so shortly before the touch the motion is not called off", unit="s", minimum=0.0, maximum=1.0
-    )
-    enter_share: float = option(
-        0.15, "share of the planned velocity limits at which the arm moves outside the plane of play",
-        minimum=0.01, maximum=1.0,
-    )  # fmt: skip
-    joint_tolerance: float = option(
-        0.1, "how far a joint may be from its reference before the arm counts as lost", unit="rad",
-        minimum=1e-3, maximum=1.0,
-    )  # fmt: skip
-    middle: float = option(
-        0.009, "when in a contact the mallet is to move as asked for: it swings on meanwhile", unit="s",
-        minimum=0.0, maximum=0.05,
-    )  # fmt: skip
-    slower: float = option(
-        0.1, "share by which the mallet may be slower at the touch than asked for", minimum=0.0, maximum=0.9
-    )
-    tilt: MalletTilt = dataclasses.field(default_factory=MalletTilt)
-    first_rounds: int = option(
-        2, "how often a new motion is planned with the swing of the mallet that the one before makes",
-        minimum=1, maximum=10,
-    )  # fmt: skip
-    approach: OnlineConfig = dataclasses.field(
-        default_factory=lambda: OnlineConfig(
-            n_via=4, via_rate=5.0, stop_duration=0.18, warm_sigma=0.2,
-            search=VpstoConfig(population=16, iterations=4),
-        )
-    )  # fmt: skip
-    home: OnlineConfig = dataclasses.field(
-        default_factory=lambda: OnlineConfig(
-            n_via=3, stop_duration=0.0, warm_sigma=0.2, search=VpstoConfig(population=12, iterations=2)
-        )
-    )
-    attempts: int = option(
-        4, "cycles in which a motion into a new contact is searched before it is refused", minimum=1,
-        maximum=100,
-    )  # fmt: skip
-    first_iterations: int = option(
-        8, "iterations of a search that has nothing to start from", minimum=1, maximum=1000
-    )
-
-    def __post_init__(self) -> None:
-        validate(self)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MalletContact:
-    """What the contact planner asks for.
-
-    Attributes:
-        time: of the touch [s].
-        mallet: x, y, vx, vy of the mallet's centre then, table frame, shape (4,) [m, m/s].
-
-    Raises:
-        InvalidInputError: a number is not finite, or the mallet stands still.
-    """
-
-    time: float
-    mallet: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        mallet = np.array(self.mallet, dtype=float)
-        if mallet.shape != (4,) or not (np.isfinite(mallet).all() and np.isfinite(self.time)):
-            raise InvalidInputError(f"a contact needs a time and a state (4,), finite, got {self.mallet!r}")
-        if np.hypot(mallet[2], mallet[3]) < 1e-3:
-            raise InvalidInputError("a contact needs a mallet that moves")
-        mallet.setflags(write=False)
-        object.__setattr__(self, "mallet", mallet)
-
-    @property
-    def angle(self) -> float:
-        """Direction of the motion [rad]."""
-        return float(np.arctan2(self.mallet[3], self.mallet[2]))
-
-    def continues(self, other: "MalletContact | None") -> bool:
-        """Whether it is another one, told anew."""
-        return other is not None and same_touch(self.time, self.mallet, other.time, other.mallet)
-
 
 _Planned = tuple[Trajectory, MalletContact, Cell, Trajectory | None, Trajectory | None]
 """What a step planned: all of it, the contact, its entry, and the motions into it and home."""
