@@ -97,7 +97,7 @@ def test_the_report_shows_what_the_nodes_drew(short_run):
 @pytest.fixture(scope="module")
 def short_game(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo") / "air_hockey"
-    demo = start(out, "--duration", "20", "--seed", "1004", demo="air_hockey")
+    demo = start(out, "--duration", "30", "--seed", "1004", demo="air_hockey")
     return out, demo.communicate(timeout=300)[0], demo.returncode
 
 
@@ -107,7 +107,7 @@ def test_a_game_leaves_what_it_promises_and_keeps_the_rules(short_game):
     assert {entry.name for entry in out.iterdir()} >= promised, text
     summary = json.loads((out / "summary.json").read_text())
     assert status == (1 if summary["failures"] else 0)
-    assert summary["pucks"] == 10 and any(shot["speed_m_s"] > 0.3 for shot in summary["shots"])
+    assert summary["pucks"] == 10 and any((shot["speed_m_s"] or 0.0) > 0.3 for shot in summary["shots"])
     assert summary["limit_violations"] == 0 and summary["rule_violations"] == dict.fromkeys(KINDS, 0)
     # The controller refuses a plan that continues one that it did not get in time, and no other.
     assert summary["refused_trajectories"] == 0 or summary["mpc"]["deadline_misses"] > 0

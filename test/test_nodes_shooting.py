@@ -257,6 +257,14 @@ def test_a_puck_alone_is_previewed_for_as_long_as_asked():
     assert np.all(np.diff(seen.mean[:, 0]) > 0.0)
 
 
+def test_a_puck_that_leaves_is_previewed_as_far_as_the_goal():
+    state = PuckState(1.0, np.array([0.5, 0.0, 2.0, 0.0]), 1e-6 * np.eye(4), 0, "")
+    seen = preview(MODEL, ShootingConfig(), state, None)
+    assert seen.touch == len(seen.times) == len(seen.mean) < 20
+    assert (seen.mean[:-1, 0] <= MODEL.table.half_length).all()
+    assert MODEL.table.half_length < seen.mean[-1, 0] < MODEL.table.half_length + 0.15
+
+
 # MPC
 
 

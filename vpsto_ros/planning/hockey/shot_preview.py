@@ -56,16 +56,22 @@ def preview(
     before = np.linspace(0.0, ahead, max(math.ceil(ahead / step), 1) + 1)
     mean, covariance = model.predict(puck.mean, puck.covariance, before)
     if shot is None:
-        return ShotPreview(puck.stamp + before, mean, covariance, len(before))
+        kept = _on_table(model, mean)
+        return ShotPreview(puck.stamp + before[kept], mean[kept], covariance[kept], int(kept.sum()))
     start, spread = _hit(model, config, mean[-1], covariance[-1], shot)
     after = np.arange(0.0, longest, step)
     onward, spreads = model.predict(start, spread, after)
-    # Up to the first one behind a goal line.
-    kept = np.cumsum(np.abs(onward[:, 0]) > model.table.half_length) <= 1
+    kept = _on_table(model, onward)
     return ShotPreview(
         np.concatenate([puck.stamp + before, puck.stamp + ahead + after[kept]]),
         np.concatenate([mean, onward[kept]]), np.concatenate([covariance, spreads[kept]]), len(before),
     )  # fmt: skip
+
+
+def _on_table(model: PuckModel, states: NDArray) -> NDArray[np.bool_]:
+    """Which states (K, 4) on a way (K,) are on the table, and the first one behind a goal line."""
+    behind = np.abs(states[:, 0]) > model.table.half_length
+    return np.cumsum(np.cumsum(behind)) <= 1
 
 
 def _hit(
