@@ -141,8 +141,9 @@ def test_the_learned_model_is_what_the_table_was_measured_to_do(steps):
 
 
 def test_a_widened_model_holds_for_steps_that_it_has_not_seen(steps):
-    distances = step_distances(record(range(60), 4), learn(steps)[0])
+    distances = step_distances(record(range(160), 4), learn(steps)[0])
     for mode in (WALL, MALLET):
+        assert len(distances[mode]) > 60, "so that one more or less outside is no matter"
         assert np.mean(distances[mode] < puck_model.ellipse(95)) > 0.85
 
 
