@@ -21,7 +21,7 @@ from vpsto_ros.estimation.measurement import finite_array
 from vpsto_ros.estimation.puck_filter import PuckFilter, PuckFilterConfig, PuckState
 from vpsto_ros.exceptions import InvalidInputError
 from vpsto_ros.planning.hockey.shooting import ShootingPlanner
-from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot, middle_strike
 from vpsto_ros.planning.hockey.shooting_policy import ShootingPolicy
 from vpsto_ros.planning.hockey.strike_mpc import StrikeMpc
 from vpsto_ros.planning.hockey.strike_mpc_config import StrikeMpcConfig
@@ -188,7 +188,7 @@ class HockeyAgent:
 
     def _warm_up(self) -> None:
         """Shoot at an imaginary puck that lies still, so that everything is compiled, and forget it."""
-        place = self._table + (-0.5, 0.05)
+        place = self._table + middle_strike(self._strikes)[0]
         q, qd = np.array(self._strikes.rules.home), np.zeros(7)
         for k in range(_WARM_UP):
             now = self.config.period * k
