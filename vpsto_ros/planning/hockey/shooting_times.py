@@ -49,11 +49,13 @@ class ContactTimes:
         search: of a shot at a contact time.
         policy: gives the angle at each contact time, or None for the grid of angles.
         caution: factor on the time that the arm is said to need, 1 until it has refused a shot.
+        pace: share of the largest speeds that is asked for, likewise.
     """
 
     def __init__(self, search: ShotSearch, policy: ShootingPolicy | None, rng: np.random.Generator) -> None:
         """Hold what is searched with."""
         self.search, self.policy, self._rng, self.caution = search, policy, rng, 1.0
+        self.pace = 1.0
         strikes = search.strikes
         self._low = np.array([strikes.x[0], strikes.y[0]])
         self._high = np.array([strikes.x[-1], strikes.y[-1]])
@@ -172,6 +174,7 @@ class ContactTimes:
         if rows.size:
             spare = (np.repeat(available, shape[1])[rows] - self.search.config.lead_margin) / self.caution
             timely[rows] = self.search.strikes.timely_speeds(joints, puck[rows], angles[rows], spare)
+            timely[rows] *= self.pace
             if not timely.any():
                 objection = (9, "the arm cannot be there in time")
         return timely.reshape(shape), np.where(there, speeds, 0.0).reshape(shape), objection

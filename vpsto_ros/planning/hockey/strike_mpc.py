@@ -73,6 +73,7 @@ class StrikeMpc(ReferencePlanner):
         self._swing: tuple[float, NDArray] | None = None
         self._planned: _Planned | None = None
         self._hint: NDArray | None = None
+        self._home_hint: NDArray | None = None
         self.forget_plan()
 
     def forget_plan(self) -> None:
@@ -81,7 +82,7 @@ class StrikeMpc(ReferencePlanner):
         self._cell: Cell | None = None
         self._planned = None
         self._tried: MalletContact | None = None
-        self._attempts, self._hint = 0, None
+        self._attempts, self._hint, self._home_hint = 0, None, None
         self._approach.accept(None)
         self._return.accept(None)
 
@@ -214,7 +215,7 @@ class StrikeMpc(ReferencePlanner):
         """Plan into the touch, on, and home."""
         fresh = not contact.continues(self.contact)
         if not contact.continues(self._tried):
-            self._attempts, self._hint = 0, None
+            self._attempts, self._hint, self._home_hint = 0, None, None
         self._tried = contact
         cell = self._cell
         if fresh or cell is None:
@@ -338,7 +339,7 @@ class StrikeMpc(ReferencePlanner):
         """
         end = ArmState(np.inf, self.home, np.zeros(7))
         rest = begin.position + 0.5 * self.table.config.brake * begin.velocity
-        motion, before = PlayMotion(self.play, begin, end, rest), self._return.previous
+        motion, before = PlayMotion(self.play, begin, end, rest, hint=self._home_hint), self._return.previous
         if before is not None:
             # While the touch moves by millimetres, the way home need not be searched again.
             points = motion.shifted(before, self.config.home.n_via)
@@ -346,6 +347,7 @@ class StrikeMpc(ReferencePlanner):
                 return motion.trajectory(points)
         result = self._plan(self._return, motion)
         if result.trajectory is None:
+            self._home_hint = None if result.search is None else result.search.best_any_points
             raise InfeasibleError("no way home keeps limits and rules")
         self._return.accept(result.trajectory)
         return result.trajectory

@@ -260,7 +260,7 @@ class StrikeTable:
 
     def start(self, cell: Cell) -> NDArray[np.float64]:
         """About where the run-up of an entry begins at rest, joint positions (7,) [rad]."""
-        return self._starts[cell]
+        return self.straight_on(self.posture[cell], self.rates[cell], -0.5 * self.config.run_up)[0]
 
     def save(self, path: str | pathlib.Path, **origin: Any) -> None:
         """Write a file.
