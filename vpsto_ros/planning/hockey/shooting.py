@@ -33,6 +33,7 @@ _CAUTION = 1.15  # factor on the time that the arm is said to need, for every sh
 _MOST_CAUTION = 2.0
 _PACE = 0.9  # factor on the mallet's speed, likewise: slower strikes are easier to run up to
 _LEAST_PACE = 0.6
+_SLOWER_FROM = 1.4  # caution beyond which the mallet is asked to be slower, too
 _REMEMBERED = 8  # shots that were refused
 _SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
 _TURNS = np.array([0.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0])  # of a chosen angle in a step, of the largest
@@ -117,7 +118,8 @@ class ShootingPlanner:
         if shot is not None:
             self._barred = [*self._barred, shot][-_REMEMBERED:]
             self._times.caution = min(_MOST_CAUTION, _CAUTION * self._times.caution)
-            self._times.pace = max(_LEAST_PACE, _PACE * self._times.pace)
+            if self._times.caution > _SLOWER_FROM:  # that there is more time was not enough
+                self._times.pace = max(_LEAST_PACE, _PACE * self._times.pace)
         if before is not None and before.time > self._now and not self._is_barred(before):
             self._commit(before)
 
