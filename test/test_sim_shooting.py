@@ -335,6 +335,8 @@ def test_every_target_can_be_missed():
         assert missed_targets({key: row for key, row in good.items() if key != name}) == [
             f"{name} did not shoot"
         ]
+        others = {key: row for key, row in good.items() if key != name}
+        assert missed_targets(others, [player for player in PLAYERS if player != name]) == []
     for name in SPEEDS:
         for speed in (SPEEDS[name] - 0.01, None):
             assert len(missed_targets({**good, name: {**good[name], "speed_mean": speed}})) == 1

@@ -60,6 +60,8 @@ def run(demo: Demo, arguments: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, _interrupt)
     out = Path(arguments.out)
     out.mkdir(parents=True, exist_ok=True)
+    for stale in ("report.html", "summary.json", "video.mp4"):
+        (out / stale).unlink(missing_ok=True)  # of an earlier run, should this one fail
     settings = Settings.load(demo.name, arguments.seed, arguments.real_time_factor)
     bag = BagRecorder(out / "bag")
     try:

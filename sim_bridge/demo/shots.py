@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.hockey.contact_log import ONE_TOUCH
+from vpsto_ros.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from rclpy.task import Future
@@ -24,6 +25,7 @@ REST = 0.3
 """Between the end of a shot and the next puck, once the arm rests [s]."""
 AT_REST = 0.02
 """Joints that are slower rest [rad/s]."""
+_LEAST_PATIENCE = 2.5  # time for a puck, the least in which the arm can shoot [s]
 ASK_AGAIN = 0.2
 """So long after a puck could not be put down the next is tried [s]."""
 
@@ -63,7 +65,15 @@ class ShootingScript:
     """
 
     def __init__(self, duration: float, count: int = SHOTS) -> None:
-        """Prepare for a number of pucks, which share a time [s] evenly."""
+        """Prepare for a number of pucks, which share a time [s] evenly.
+
+        Raises:
+            ConfigurationError: there is too little time to shoot a puck.
+        """
+        if duration / count < _LEAST_PATIENCE:
+            raise ConfigurationError(
+                f"{count} pucks need a duration of {_LEAST_PATIENCE * count:g} s at least, got {duration:g} s"
+            )
         self.count, self._patience = count, duration / count
         self.shots: list[Shot] = []
         self._start = self._end = math.nan

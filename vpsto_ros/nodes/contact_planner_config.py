@@ -57,6 +57,11 @@ class ContactPlannerNodeConfig(NodeConfig):
     def __post_init__(self) -> None:
         validate(self)
         check_task(self.kind, self.robot, self.goal_orientation)
+        if self.setting != OWN_SETTING and self.shooting.objective != ShootingConfig().objective:
+            raise ConfigurationError(
+                f"shooting.objective is set, but setting = {self.setting} has an objective of its own; "
+                f"it counts with setting = {OWN_SETTING}"
+            )
         if self.policy and self.setting == OWN_SETTING:
             raise ConfigurationError(
                 f"policy = True needs a setting that a policy was trained for: {', '.join(SETTINGS)}"

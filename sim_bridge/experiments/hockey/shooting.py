@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     (folder / "table.md").write_text(text)
     shooting_figures.write(folder, found)
     print(f"{text}\nresults in {folder}")
-    missed = missed_targets(summary)
+    missed = missed_targets(summary, arguments.players)
     return print_verdict(not missed, "; ".join(missed) or _in_short(summary))
 
 

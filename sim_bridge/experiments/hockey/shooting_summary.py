@@ -125,10 +125,12 @@ def _rms(values: Iterable[float]) -> float | None:
     return float(np.sqrt(np.mean(finite**2))) if finite.size else None
 
 
-def missed_targets(summary: dict[str, Any]) -> list[str]:
-    """What falls short, in words; a player that did not shoot falls short, too."""
+def missed_targets(summary: dict[str, Any], asked: Sequence[str] = PLAYERS) -> list[str]:
+    """What falls short, in words; a player that was asked to shoot and did not falls short, too."""
     checks = {}
     for name, least in SCORES.items():
+        if name not in asked:
+            continue
         row = summary.get(name)
         if row is None:
             checks[f"{name} did not shoot"] = False
