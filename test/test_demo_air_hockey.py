@@ -17,6 +17,7 @@ from sim_bridge.demo.verdict import verdict
 from sim_bridge.hockey.rules import KINDS
 from sim_bridge.report.recording import JointSeries, PoseSeries, Recording, Status
 from sim_bridge.report.summary import RunFacts
+from vpsto_ros.exceptions import ConfigurationError
 from vpsto_ros.nodes.contact_planner_config import ContactPlannerNodeConfig
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.nodes.state_estimator_config import StateEstimatorConfig
@@ -267,3 +268,8 @@ def air_hockey_parameters(settings):
     content = yaml.safe_load(settings.file.read_text())
     names = ("state_estimator", "contact_planner", "mpc_planner")
     return {name: _parameters(content, name) for name in names}
+
+
+def test_too_little_time_for_all_pucks_is_refused():
+    with pytest.raises(ConfigurationError, match="at least"):
+        ShootingScript(1.0)

@@ -35,7 +35,7 @@ from vpsto_ros.nodes.mpc_planner import MpcPlannerNode
 from vpsto_ros.nodes.mpc_planner_config import MpcPlannerConfig
 from vpsto_ros.nodes.table_frame import HockeyTableConfig, PlayingSurfaceConfig
 from vpsto_ros.planning.contact import ContactPlan
-from vpsto_ros.planning.hockey.shooting_config import ShootingConfig, Shot
+from vpsto_ros.planning.hockey.shooting_config import SETTINGS, ShootingConfig, Shot
 from vpsto_ros.planning.hockey.shot_preview import preview
 from vpsto_ros.planning.hockey.strikes import StrikeTable
 from vpsto_ros.robot.iiwa import JOINT_NAMES, iiwa14
@@ -425,3 +425,10 @@ def test_the_kind_decides_whose_lead_counts():
     assert set(config.searches) == {"strike.approach.search", "strike.home.search"}
     with pytest.raises(ConfigurationError, match=r"strike.lead"):
         MpcPlannerConfig(kind="shooting", rate=50.0, deadline=0.0195)
+
+
+def test_an_objective_beside_a_setting_is_refused():
+    own = dataclasses.replace(SETTINGS["balanced"], beta=0.9)
+    with pytest.raises(ConfigurationError, match="objective"):
+        ContactPlannerNodeConfig(kind="shooting", shooting=ShootingConfig(objective=own))
+    assert ContactPlannerNodeConfig(kind="shooting", setting="own", shooting=ShootingConfig(objective=own))
