@@ -118,6 +118,7 @@ class StrikeMpc(ReferencePlanner):
 
     def warm_up(self) -> None:
         """Compile what a strike of the table uses: wait at home, strike, go home; then forget it."""
+        way_in(self.play, self.home, 0.0, self.config.enter_share)
         place, speed = middle_strike(self.table)
         mallet = np.array([place[0] - self.table.contact_distance, place[1], 0.8 * speed, 0.0])
         contact, still = MalletContact(self.config.longest + 0.4, mallet), np.zeros(7)
