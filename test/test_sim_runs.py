@@ -326,12 +326,12 @@ def test_control_c_keeps_what_is_finished(tmp_path, jobs):
             break
         time.sleep(0.05)
     os.killpg(first.pid, signal.SIGINT)
-    out, errors = first.communicate(timeout=60.0)
+    out, errors = first.communicate(timeout=180.0)
     assert first.returncode == 130, errors
     assert "4 of 8 runs are kept" in errors and "--resume" in errors and "Traceback" not in errors
     (tmp_path / "go").touch()
     second = interrupted(tmp_path, "--jobs", jobs, "--resume")
-    out, errors = second.communicate(timeout=60.0)
+    out, errors = second.communicate(timeout=180.0)
     assert second.returncode == 0, errors
     assert "waits: 4 of 8 runs taken over" in out
     assert "results [0, 1, 2, 3, 4, 5, 6, 7]" in out
