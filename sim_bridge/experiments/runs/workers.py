@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import pickle
 import signal
 import threading
@@ -94,7 +95,8 @@ def in_processes(
     import joblib
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    calls = (joblib.delayed(_in_worker)(work, index, task) for index, task in tasks)
+    here = os.getpid()
+    calls = (joblib.delayed(_in_worker)(work, index, task, here) for index, task in tasks)
     with joblib.parallel_config("loky", inner_max_num_threads=1):
         # Arrays are sent, not mapped from a shared file: a trial may write into its task.
         parallel = joblib.Parallel(
@@ -124,10 +126,12 @@ def _interrupts_wait() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _in_worker(work: Callable[[Any], Any], index: int, task: Any) -> tuple[int, Outcome]:
-    with contextlib.suppress(ValueError):  # not the main thread
-        # Ctrl-C reaches the whole process group; the parent decides what to do about it.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _in_worker(work: Callable[[Any], Any], index: int, task: Any, parent: int) -> tuple[int, Outcome]:
+    # Ctrl-C reaches the whole process group; the parent decides what to do about it. The parent itself, where
+    # joblib falls back to it, must go on hearing it.
+    if os.getpid() != parent:
+        with contextlib.suppress(ValueError):  # not the main thread
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
     return index, attempt(work, task)
 
 
