@@ -150,7 +150,8 @@ def test_a_contact_is_as_sure_as_the_puck_will_be(shooter):
     message, task = shooter.received["contact_plan"][-1], shooter.node.task
     seen = preview(MODEL, task.planner.config, task.puck, task.planner.committed)
     sent = read_contact(message, SIMULATED, FRAME).covariance
-    np.testing.assert_allclose(sent, seen.at_touch[:2, :2] + 1e-8 * np.eye(2), rtol=0.05, atol=1e-12)
+    expected = seen.covariance[seen.touch - 1][:2, :2] + 1e-8 * np.eye(2)
+    np.testing.assert_allclose(sent, expected, rtol=0.05, atol=1e-12)
 
 
 def test_a_refused_shot_is_dropped_and_another_is_sought(shooter):
@@ -236,7 +237,7 @@ def test_a_preview_agrees_with_samples_of_the_model():
     assert seen.times[seen.touch] == pytest.approx(0.5) and seen.mean[-1, 0] > MODEL.table.half_length
     assert np.linalg.eigvalsh(seen.covariance).min() > 0.0
     index = seen.touch + 20  # 0.4 s after the touch
-    starts = rng.multivariate_normal(seen.mean[seen.touch - 1], seen.at_touch, 4000)
+    starts = rng.multivariate_normal(seen.mean[seen.touch - 1], seen.covariance[seen.touch - 1], 4000)
     direction = np.array([np.cos(shot.angle), np.sin(shot.angle)])
     place = seen.mean[seen.touch - 1, :2] - MODEL.table.contact_distance * direction
     mallets = np.tile(np.concatenate([place, shot.speed * direction]), (len(starts), 1))

@@ -281,6 +281,21 @@ def test_as_many_refused_shots_are_remembered_as_promised():
     assert len(agent._barred) == shooting._REMEMBERED
 
 
+def test_refusals_make_it_ask_for_later_and_slower_shots_until_it_forgets():
+    agent, states = planner(), course([-0.4, 0.1, 0.0, 0.0], 30)
+    first = run(agent, states[:12])[-1]
+    agent.forget()
+    for k in range(60):
+        agent.plan(PERIOD * k, state(PERIOD * k, [-0.4, 0.1, 0.0, 0.0]), START)
+        if agent.committed is not None:
+            last = agent.committed, PERIOD * k
+            agent.refuse()
+    assert last[0].speed < 0.95 * first.speed and last[0].time - last[1] > 1.2 * first.time
+    agent.forget()
+    again = run(agent, states[:12])[-1]
+    assert (again.time, again.speed, again.angle) == (first.time, first.speed, first.angle)
+
+
 def test_the_same_touch_is_so_in_time_place_and_direction():
     mallet = np.array([-0.5, 0.1, 1.0, 0.2])
     turned = np.array([-0.5, 0.1, 1.0, -0.4])

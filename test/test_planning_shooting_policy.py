@@ -243,6 +243,7 @@ def test_fingerprints_outlast_files(tmp_path):
     MODEL.save(tmp_path / "puck.json")
     STRIKES.save(tmp_path / "strikes.npz")
     again = PuckModel.load(tmp_path / "puck.json"), StrikeTable.load(tmp_path / "strikes.npz")
+    assert [each.fingerprint for each in again] == [MODEL.fingerprint, STRIKES.fingerprint]
     loaded("aggressive", saved(tmp_path / "policies.npz"), *again)
 
 

@@ -15,7 +15,6 @@ from sim_bridge.hockey.recordings import (
     Recorder,
     Strike,
     kind_of,
-    mallet_contacts,
     strike_command,
 )
 from sim_bridge.hockey.scene import START_JOINTS
@@ -47,6 +46,10 @@ def shipped():
 
 
 # Recordings.
+
+
+def mallet_contacts(episode):
+    return [contact for contact in episode.contacts if contact.surface == "mallet"]
 
 
 def test_recordings_are_in_the_table_frame_and_on_the_table(episodes):

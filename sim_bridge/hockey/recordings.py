@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_bridge.hockey import table
-from sim_bridge.hockey.contact_log import MALLET, PuckContact
+from sim_bridge.hockey.contact_log import PuckContact
 from sim_bridge.hockey.scene import START_JOINTS, AirHockeyScene
 from sim_bridge.hockey.world import AirHockeyWorld
 from sim_bridge.trajectory_follower import TrajectoryCommand
@@ -238,8 +238,3 @@ def joints_along(
         rows.append(q)
         speeds.append(np.linalg.pinv(robot.jacobian(q)[:3]) @ rate)
     return np.array(rows), np.array(speeds)
-
-
-def mallet_contacts(episode: Episode) -> list[PuckContact]:
-    """Contacts with the mallet."""
-    return [contact for contact in episode.contacts if contact.surface == MALLET]

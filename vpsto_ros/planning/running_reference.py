@@ -29,9 +29,8 @@ class MpcStep:
             is nothing to execute. It begins
             with what is left of the running one until the new plan takes over and ends at rest.
         mode: "explore", "warm_start", "stop" (no via-points), "robust", "deterministic" (what robust pushing
-            plans), "hold" (goal reached), "brake" (no valid plan),
-            "enter" (on
-            the way into the plane), "wait" (not ready).
+            plans), "hold" (goal reached), "follow" (what runs goes on), "return" (on the way home),
+            "brake" (no valid plan), "enter" (on the way into the plane), "wait" (not ready).
         valid: whether it is a plan that works, as opposed to a safe stop.
         message: what happened, in words, for people.
         cost: cost of the plan [s], inf without one.

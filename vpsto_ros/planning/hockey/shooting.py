@@ -29,11 +29,6 @@ SEARCHING = "contact times are being searched"
 """Why there is no shot yet, before the first round is over."""
 STRUCK = "the puck has just been struck"
 """Why there is no shot for a moment after a touch."""
-_CAUTION = 1.15  # factor on the time that the arm is said to need, for every shot that it refuses
-_MOST_CAUTION = 2.0
-_PACE = 0.9  # factor on the mallet's speed, likewise: slower strikes are easier to run up to
-_LEAST_PACE = 0.6
-_SLOWER_FROM = 1.4  # caution beyond which the mallet is asked to be slower, too
 _REMEMBERED = 8  # shots that were refused
 _SPEED_LEFT = 0.98  # share of a shot's speed that must still be possible when it is chosen
 _TURNS = np.array([0.0, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0])  # of a chosen angle in a step, of the largest
@@ -84,6 +79,7 @@ class ShootingPlanner:
     def forget(self) -> None:
         """Begin anew, as after a restart."""
         self._drop(SEARCHING)
+        self._times.be_confident()
         self._barred: list[Shot] = []
         self._now = self._struck = -math.inf  # times of the last step and of the last touch [s]
 
@@ -117,9 +113,7 @@ class ShootingPlanner:
         self._drop(SEARCHING)
         if shot is not None:
             self._barred = [*self._barred, shot][-_REMEMBERED:]
-            self._times.caution = min(_MOST_CAUTION, _CAUTION * self._times.caution)
-            if self._times.caution > _SLOWER_FROM:  # that there is more time was not enough
-                self._times.pace = max(_LEAST_PACE, _PACE * self._times.pace)
+            self._times.be_cautious()
         if before is not None and before.time > self._now and not self._is_barred(before):
             self._commit(before)
 
@@ -140,13 +134,14 @@ class ShootingPlanner:
         objection = self._objection(now, puck, posture)
         if objection or puck is None:
             self._drop(objection)
-            self._times.caution = self._times.pace = 1.0  # the next puck is another one
+            self._times.be_confident()  # the next puck is another one
             return None
         if now < self._now:  # a clock that was set back
             self.forget()
         self._now = now
         if self.committed is not None and now >= self.committed.time:
-            self._struck, self._times.caution, self._times.pace = self.committed.time, 1.0, 1.0
+            self._struck = self.committed.time
+            self._times.be_confident()
             self._drop(STRUCK)
         if now - self._struck < self.config.pause:
             return None

@@ -15,6 +15,11 @@ from vpsto_ros.robot.iiwa import iiwa14
 Objection = tuple[int, str]
 """What rules a shot out, and how far it had come until then; the farthest one is told."""
 NO_OBJECTION: Objection = (-1, "")
+_CAUTION, _MOST_CAUTION = 1.15, 2.0
+"""Factor on the time that the arm is said to need, for every shot that it refuses, and the largest."""
+_SLOWER_FROM = 1.4  # caution beyond which the mallet is asked to be slower, too
+_PACE, _LEAST_PACE = 0.9, 0.6
+"""Factor on the mallet's speed, likewise: slower strikes are easier to run up to; and the least."""
 _SOONEST = 0.05  # no touch is planned so soon [s]
 _SURE = 2.0  # standard deviations of its place by which a puck must be within reach
 _BEYOND = 0.01  # how far beyond the reach a chosen shot may get [m]
@@ -54,11 +59,21 @@ class ContactTimes:
 
     def __init__(self, search: ShotSearch, policy: ShootingPolicy | None, rng: np.random.Generator) -> None:
         """Hold what is searched with."""
-        self.search, self.policy, self._rng, self.caution = search, policy, rng, 1.0
-        self.pace = 1.0
+        self.search, self.policy, self._rng = search, policy, rng
+        self.caution, self.pace = 1.0, 1.0
         strikes = search.strikes
         self._low = np.array([strikes.x[0], strikes.y[0]])
         self._high = np.array([strikes.x[-1], strikes.y[-1]])
+
+    def be_cautious(self) -> None:
+        """The arm has refused a shot: count on more time, and where that was not enough on less speed."""
+        self.caution = min(_MOST_CAUTION, _CAUTION * self.caution)
+        if self.caution > _SLOWER_FROM:
+            self.pace = max(_LEAST_PACE, _PACE * self.pace)
+
+    def be_confident(self) -> None:
+        """The arm is taken at its word again."""
+        self.caution = self.pace = 1.0
 
     def begin(self, now: float) -> Round:
         """A new round from a time [s] on."""

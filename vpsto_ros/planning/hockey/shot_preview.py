@@ -32,11 +32,6 @@ class ShotPreview:
     covariance: NDArray[np.float64]
     touch: int
 
-    @property
-    def at_touch(self) -> NDArray[np.float64]:
-        """Covariance of the puck just before the touch, shape (4, 4); at the end without a shot."""
-        return self.covariance[self.touch - 1]
-
 
 def preview(
     model: PuckModel, config: ShootingConfig, puck: PuckState, shot: Shot | None, *, step: float = 0.05,

@@ -6,8 +6,7 @@ posture at the touch is the tabulated one in which the mallet is fast.
 """
 
 import dataclasses
-import time
-from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +24,15 @@ from vpsto_ros.robot.iiwa import iiwa14
 from vpsto_ros.robot.iiwa_kinematics import arm_points
 from vpsto_ros.trajectory import Trajectory
 
-_Planned = tuple[Trajectory, MalletContact, Cell, Trajectory | None, Trajectory | None]
-"""What a step planned: all of it, the contact, its entry, and the motions into it and home."""
+
+class _Planned(NamedTuple):
+    """What a step planned: the whole motion, the contact, its entry, and the motions into it and home."""
+
+    whole: Trajectory
+    contact: MalletContact
+    cell: Cell
+    approach: Trajectory | None
+    onwards: Trajectory | None
 
 
 class StrikeMpc(ReferencePlanner):
@@ -43,22 +49,20 @@ class StrikeMpc(ReferencePlanner):
     """
 
     def __init__(
-        self, table: StrikeTable, config: StrikeMpcConfig | None = None, *, seed: int = 0,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:  # fmt: skip
+        self, table: StrikeTable, config: StrikeMpcConfig | None = None, *, seed: int = 0
+    ) -> None:
         """Nothing is being followed yet.
 
         Args:
             table: the strikes.
             config: options.
             seed: of the searches.
-            clock: for deadlines of the searches [s].
         """
         self.config, self.table = config or StrikeMpcConfig(), table
         super().__init__(iiwa14(), 2, self.config.lead, self.config.joint_tolerance, memory=1.0)
         rules = table.rules
         self.play = Play(rules, rules.limits(self.robot))
-        self.home, self._clock = np.array(rules.home), clock
+        self.home = np.array(rules.home)
         rng = np.random.default_rng(seed)
         self._approach = OnlineVpsto(self.config.approach, rng)
         self._return = OnlineVpsto(self.config.home, rng)
@@ -71,20 +75,19 @@ class StrikeMpc(ReferencePlanner):
         }
         self._usual = {online: online.config for online in self._first}
         self._swing: tuple[float, NDArray] | None = None
-        self._planned: _Planned | None = None
-        self._hint: NDArray | None = None
-        self._home_hint: NDArray | None = None
+        self.contact: MalletContact | None
+        self._cell: Cell | None
+        self._tried: MalletContact | None
+        self._planned: _Planned | None
+        self._hint: NDArray | None
+        self._home_hint: NDArray | None
         self.forget_plan()
 
     def forget_plan(self) -> None:
         """Do not warm-start from the last plan."""
-        self.contact: MalletContact | None = None
-        self._cell: Cell | None = None
-        self._planned = None
-        self._tried: MalletContact | None = None
+        self.forget_contact()
+        self._planned = self._tried = None
         self._attempts, self._hint, self._home_hint = 0, None, None
-        self._approach.accept(None)
-        self._return.accept(None)
 
     def step(
         self, now: float, joint_position: ArrayLike, joint_velocity: ArrayLike,
@@ -131,10 +134,10 @@ class StrikeMpc(ReferencePlanner):
         """Take note that a step's trajectory is being executed."""
         super().accept(step)
         planned, self._planned = self._planned, None
-        if planned is not None and step.refused is False and planned[0] is step.plane:
-            self.contact, self._cell = planned[1], planned[2]
-            self._approach.accept(planned[3])
-            self._return.accept(planned[4])
+        if planned is not None and planned.whole is step.plane:
+            self.contact, self._cell = planned.contact, planned.cell
+            self._approach.accept(planned.approach)
+            self._return.accept(planned.onwards)
 
     def forget_contact(self) -> None:
         """The touch is over."""
@@ -232,7 +235,7 @@ class StrikeMpc(ReferencePlanner):
             result, whole = self._through(now, begin, cell, contact, None if fresh else self._running)
             for _ in range(self.config.first_rounds - 1 if fresh else 0):
                 result, whole = self._through(now, begin, cell, contact, whole)
-            self._planned = (whole, contact, cell, self._approach.previous, self._return.previous)
+            self._planned = _Planned(whole, contact, cell, self._approach.previous, self._return.previous)
         except InfeasibleError as error:
             return self._refuse(now, str(error), fresh)
         finally:  # what is planned is only remembered when it is accepted

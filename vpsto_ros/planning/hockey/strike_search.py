@@ -14,6 +14,14 @@ import math
 import numpy as np
 from numba import njit
 
+from vpsto_ros.planning.hockey.motion_kernels import (
+    CLEARANCE,
+    HEIGHT,
+    LEAST_X,
+    MOST_Y,
+    ROD_TILT,
+    TOLERANCE,
+)
 from vpsto_ros.robot.iiwa_kinematics import add_least_motion, chain, jacobian, move_to
 
 _SAMPLES = 9  # of a strike, at which places are checked
@@ -22,8 +30,7 @@ _DIFFERENCE = 0.01  # step of the difference that gives the curvature [s]
 _PARALLEL = 1e-7  # columns of the Jacobian whose cross product is less [m^2]
 _NO_PART = 1e-8  # of a joint in the dual, relative to its length [m]
 
-# Entries of the row of rules: the first six are those of PlayRules.kernel_row, the others of StrikeConfig.
-HEIGHT, TOLERANCE, LEAST_X, MOST_Y, CLEARANCE, ROD_TILT = range(6)
+# Entries of the row of rules behind those of PlayRules.kernel_row, from StrikeConfig.
 RUN_UP, HOLD, BRAKE, LEAD_WEIGHT, STEEPNESS = range(6, 11)
 
 
